@@ -1,0 +1,48 @@
+PYTHON ?= python3
+EXPERIMENT ?= reach1d
+ARGS ?=
+
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.setup
+
+.DEFAULT_GOAL := help
+.PHONY: help setup train test lint bench figures clean
+
+help: ## Print this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
+
+setup: $(READY) ## Create .venv with the pinned dependencies (PYTHON=python3.12 picks the interpreter)
+
+train: $(READY) ## Train EXPERIMENT=reach1d; ARGS="seed=3 device=cpu" overrides its settings
+	$(BIN)/python -m pirl_rl.train +experiment=$(EXPERIMENT) $(ARGS)
+
+test: $(READY) ## Run the tests that are neither slow nor gpu; ARGS go to pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
+
+lint: $(READY) ## Check style, format and types
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/pyright
+
+bench: $(READY) ## Time the learner and the simulator on one thread
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/learner.py
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/simulator.py
+
+figures: $(READY) ## Draw the comparison of methods from its runs
+	$(BIN)/python -m pirl_rl.compare runs/reach1d_comparison
+
+clean: ## Remove .venv, caches and build output; runs stay
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# pip comes last into a new environment and .setup last of all, so what was interrupted starts again.
+$(BIN)/pip:
+	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) not found: name a Python 3.11 or newer with PYTHON=..." >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, $(PYTHON) is " + sys.version.split()[0] + ": name another with PYTHON=...")'
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "$(PYTHON) cannot create virtual environments: install its venv module (on Debian and Ubuntu the package python3-venv)" >&2; exit 1; }
+	$(PYTHON) -m venv --clear $(VENV)
+
+$(READY): pyproject.toml constraints.txt | $(BIN)/pip
+	$(BIN)/python -m pip install -c constraints.txt -e '.[dev]'
+	@touch $@

@@ -1,0 +1,194 @@
+"""Time of whole learner updates on one thread: the Ito fast path, compiled and eager, against nested autograd.
+
+    python benchmarks/learner.py [--rounds 15] [--updates 20]
+
+An update is TD, HJB and boundary terms, backward, fused Adam, and every second time the actor with its Adam and the soft
+update of the targets. All contenders share networks, points, optimisers and this loop. "nested" differentiates the same
+critics by one gradient with create_graph and one Hessian-vector product per noise channel, both critics at once; it
+cannot be compiled, so its other terms run eagerly, or compiled in "nested, rest compiled". "HJB term" is that loss alone, forward and
+backward. The contenders take turns within every round; figures are medians over the rounds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from pirl_rl.collocation import BoundarySampler, Collocation
+from pirl_rl.losses import PIRLLoss
+from pirl_rl.networks import Actor, Critic
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.problems import Reach1D
+from pirl_rl.sets import Box
+
+POLYAK = 0.005
+
+
+class SevenStates(ReachAvoidProblem):
+    """The sizes of the drifting vehicle: 7 states, 2 controls, noise on the first 6 states; reach x_1 >= 2."""
+
+    horizon = 5.0
+    states = Box([-3.0] * 7, [3.0] * 7)
+    controls = Box([-1.0] * 2, [1.0] * 2)
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.sin(x).roll(1, -1) + torch.nn.functional.pad(u, (0, 5))
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return (0.1 * torch.eye(7, 6).to(x)).expand(*x.shape[:-1], 7, 6)
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return 2 - x[..., 0]
+
+
+class NestedLoss(PIRLLoss):
+    """The same loss with the generator by nested autograd."""
+
+    def residuals(self, tau: Tensor, x: Tensor, action: Tensor, u: Tensor) -> Tensor:
+        f, sigma = self.problem.drift(x, u), self.problem.diffusion(x, u)
+        count = self.num_qvalue_nets
+        y = torch.cat([tau.unsqueeze(-1), x], -1).expand(count, -1, -1).contiguous().requires_grad_()
+        with self.critics() as critic:
+            value = critic(y[..., :1], y[..., 1:], action.expand(count, -1, -1))
+        (gradient,) = torch.autograd.grad(value.sum(), y, create_graph=True)
+        result = -gradient[..., 0] + (gradient[..., 1:] * f).sum(-1)
+        for column in sigma.unbind(-1):
+            along = (gradient[..., 1:] * column).sum()
+            (product,) = torch.autograd.grad(along, y, create_graph=True)
+            result = result + (product[..., 1:] * column).sum(-1) / 2
+        return result
+
+
+@dataclass(frozen=True)
+class Shape:
+    name: str
+    problem: ReachAvoidProblem
+    critic: tuple[int, ...]
+    transitions: int
+    collocation: int = 1_000
+    boundary: int = 200
+
+
+SHAPES = (
+    Shape("drift: 8 + 2 inputs, 6 channels, critics 3x64", SevenStates(), (64, 64, 64), 256),
+    Shape("1-D: 2 + 1 inputs, 1 channel, critics 3x32", Reach1D(), (32, 32, 32), 128),
+)
+
+
+def make_batch(shape: Shape) -> TensorDict:
+    problem, generator = shape.problem, torch.Generator().manual_seed(0)
+    collocation = Collocation(problem, shape.collocation).sample(generator)
+    boundary = BoundarySampler(problem, shape.boundary // 2, shape.boundary // 2).sample(generator)
+    points = Collocation(problem, shape.transitions)
+    replay, following = points.sample(generator).exclude("mask"), points.sample(generator).exclude("mask")
+    replay["action"] = 2 * torch.rand(shape.transitions, problem.controls.dim, generator=generator) - 1
+    following["reward"] = torch.rand(shape.transitions, 1, generator=generator)
+    following["terminated"] = following["done"] = torch.rand(shape.transitions, 1, generator=generator) < 0.1
+    replay["next"] = following
+    return TensorDict({"replay": replay, "collocation": collocation, "boundary": boundary})
+
+
+class Learner:
+    """One contender: `update()` is a whole update, `hjb()` the HJB term alone, forward and backward."""
+
+    def __init__(self, shape: Shape, kind: type[PIRLLoss], compiled: bool):
+        torch.manual_seed(0)
+        self.loss = kind(
+            shape.problem,
+            Actor(shape.problem, (32, 32)),
+            [Critic(shape.problem, shape.critic) for _ in range(2)],
+            actor_rule="q",
+            hjb_weight=1.0,
+            boundary_weight=1.0,
+        )
+        self.batch = make_batch(shape)
+        self.critics = list(self.loss.qvalue_network_params.parameters())
+        self.actor = list(self.loss.actor_network_params.parameters())
+        self.pairs = [
+            (list(target.values(True, True)), [entry.data for entry in source.values(True, True)])
+            for target, source in (
+                (self.loss.target_actor_network_params.data, self.loss.actor_network_params),
+                (self.loss.target_qvalue_network_params.data, self.loss.qvalue_network_params),
+            )
+        ]
+        self.critic_adam = torch.optim.Adam(self.critics, 1e-4, fused=True)
+        self.actor_adam = torch.optim.Adam(self.actor, 1e-4, fused=True)
+        wrap: Callable = torch.compile if compiled else lambda function: function
+        if compiled and kind is NestedLoss:
+            self.loss.residuals = torch.compiler.disable(self.loss.residuals)  # type: ignore[method-assign]
+        self.critic_loss, self.actor_loss = wrap(self.loss.critic_loss), wrap(self.loss.actor_loss)
+        self.hjb_loss = wrap(self.loss._hjb_loss)
+        self.count = 0
+
+    def update(self) -> None:
+        self.count += 1
+        loss, _ = self.critic_loss(self.batch)
+        self._descend(loss, self.critic_adam)
+        if self.count % 2 == 0:
+            loss, _ = self.actor_loss(self.batch)
+            self._descend(loss, self.actor_adam)
+            with torch.no_grad():
+                for targets, sources in self.pairs:
+                    torch._foreach_lerp_(targets, sources, POLYAK)
+
+    def hjb(self) -> None:
+        self.hjb_loss(self.batch["collocation"]).backward()
+        self.critic_adam.zero_grad()
+
+    @staticmethod
+    def _descend(loss: Tensor, optimiser: torch.optim.Optimizer) -> None:
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+
+
+def milliseconds(work: Callable[[], None], repeats: int) -> float:
+    start = time.perf_counter()
+    for _ in range(repeats):
+        work()
+    return 1e3 * (time.perf_counter() - start) / repeats
+
+
+def measure(shape: Shape, rounds: int, updates: int) -> None:
+    contenders = {
+        "nested autograd": Learner(shape, NestedLoss, compiled=False),
+        "nested, rest compiled": Learner(shape, NestedLoss, compiled=True),
+        "ours, eager": Learner(shape, PIRLLoss, compiled=False),
+        "ours, compiled": Learner(shape, PIRLLoss, compiled=True),
+    }
+    works = {(name, part): getattr(learner, part) for name, learner in contenders.items() for part in ("update", "hjb")}
+    for work in works.values():
+        milliseconds(work, 6)
+    times: dict[tuple[str, str], list[float]] = {key: [] for key in works}
+    for _ in range(rounds):
+        for key, work in works.items():
+            times[key].append(milliseconds(work, updates))
+    median = {key: statistics.median(entries) for key, entries in times.items()}
+    for name in contenders:
+        row = [median[name, part] for part in ("update", "hjb")]
+        gain = [median["nested autograd", part] / median[name, part] for part in ("update", "hjb")]
+        print(f"| {shape.name} | {name} | {row[0]:.2f} | {gain[0]:.2f} | {row[1]:.2f} | {gain[1]:.2f} |")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--updates", type=int, default=20)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    print(f"torch {torch.__version__}, 1 thread, medians of {arguments.rounds} x {arguments.updates} updates\n")
+    print("| shape | contender | update, ms | times faster | HJB term, ms | times faster |")
+    print("|---|---|--:|--:|--:|--:|")
+    for shape in SHAPES:
+        measure(shape, arguments.rounds, arguments.updates)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,129 @@
+"""Reach-avoid problems as TorchRL environments: the additive-reward problem of the paper's Proposition 1.
+
+A batch of paths in one TensorDict: "tau" (*, 1), the time to go, is part of the state; "state" (*, n) in SI units;
+"action" (*, m) is the control in [-1, 1] coordinates. A and B absorb, so every end, the horizon's too, is a `terminated`.
+The reward is l_eps of the last state: 1 on success, else 0 with the hard payoff.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from pirl_rl.initial_states import UniformStates
+from pirl_rl.problem import ReachAvoidProblem, check_problem
+from pirl_rl.problems import Reach1D
+from pirl_rl.simulator import Simulator, exit_value
+
+
+class ReachAvoidEnv(EnvBase):
+    """A vectorised environment over `num_envs` independent paths of one problem.
+
+    Args:
+        problem: the physics.
+        dt: control step, s.
+        substeps: integration steps in it.
+        crossing: "bridge" or "endpoint", see `pirl_rl.simulator`.
+        initial_states: the law of episodes' starts.
+        num_envs: batch size.
+        seed: of the environment's own generator; drawn from torch's where None.
+        device: of all tensors.
+
+    Raises:
+        ProblemError: a problem that contradicts itself, e.g. sets that overlap.
+        ValueError: step sizes out of range.
+    """
+
+    _supports_set_state = True
+
+    def __init__(
+        self,
+        problem: ReachAvoidProblem,
+        dt: float = 0.1,
+        substeps: int = 1,
+        crossing: str = "bridge",
+        initial_states: UniformStates | None = None,
+        num_envs: int = 64,
+        seed: int | None = None,
+        device: torch.device | str = "cpu",
+    ):
+        check_problem(problem)
+        if not (isinstance(num_envs, int) and num_envs >= 1):
+            raise ValueError(f"num_envs: expected an integer >= 1, got {num_envs!r}")
+        super().__init__(device=device, batch_size=torch.Size([num_envs]))
+        self.problem = problem
+        self._arguments = {"dt": dt, "substeps": substeps, "crossing": crossing, "initial_states": initial_states}
+        self.simulator = Simulator(problem, dt, substeps, crossing)  # type: ignore[arg-type]
+        self.initial_states = initial_states or UniformStates()
+        self.max_steps = round(problem.horizon / dt)
+        self._make_specs()
+        self.rng = torch.Generator(device=self.device)
+        self.set_seed(int(torch.empty((), dtype=torch.int64).random_().item()) if seed is None else seed)
+
+    def recipe(self, seed: int) -> Callable[[], ReachAvoidEnv]:
+        """A picklable call that builds this environment again, with another seed, on the CPU."""
+        return partial(ReachAvoidEnv, self.problem, **self._arguments, num_envs=self.batch_size[0], seed=seed)
+
+    def _make_specs(self) -> None:
+        problem, bs, device = self.problem, self.batch_size, self.device
+        self.observation_spec = Composite(
+            tau=Bounded(0.0, problem.horizon, (*bs, 1), device=device),
+            state=Unbounded((*bs, problem.states.dim), device=device),
+            shape=bs,
+            device=device,
+        )
+        self.action_spec = Bounded(-1.0, 1.0, (*bs, problem.controls.dim), device=device)
+        self.reward_spec = Bounded(0.0, 1.0, (*bs, 1), device=device)
+        flag = Categorical(2, (*bs, 1), dtype=torch.bool, device=device)
+        self.done_spec = Composite(done=flag, terminated=flag.clone(), shape=bs, device=device)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+        steps, state = self.initial_states.sample(
+            self.problem, self.batch_size[0], self.max_steps, self.rng, torch.get_default_dtype()
+        )
+        none = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
+        return TensorDict(
+            {
+                "tau": (steps * self.simulator.dt).to(state.dtype).unsqueeze(-1),
+                "state": state,
+                "done": none,
+                "terminated": none.clone(),
+            },
+            batch_size=self.batch_size,
+            device=self.device,
+        )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        tau, dt = tensordict["tau"], self.simulator.dt
+        # Whole steps to go are recovered from tau, so that rounding never adds or drops a step.
+        steps = torch.round(tau / dt) - 1
+        u = self.problem.controls.denormalize(tensordict["action"])
+        step = self.simulator.step(tensordict["state"], u, self.rng)
+        terminated = (step.reached | step.failed).unsqueeze(-1) | (steps <= 0)
+        return TensorDict(
+            {
+                "tau": (steps * dt).clamp(min=0),
+                "state": step.state,
+                "reward": exit_value(self.problem, step).unsqueeze(-1) * terminated,
+                "done": terminated,
+                "terminated": terminated.clone(),
+            },
+            batch_size=self.batch_size,
+            device=self.device,
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self.rng.manual_seed(seed)
+
+
+class Reach1DEnv(ReachAvoidEnv):
+    """The paper's one-dimensional benchmark; arguments as of `ReachAvoidEnv` but the problem."""
+
+    def __init__(self, **kwargs):
+        super().__init__(Reach1D(), **kwargs)

@@ -1,0 +1,56 @@
+"""Does the value say what the policy does? V against Monte Carlo of the learned policy."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Literal
+
+import torch
+
+from pirl_rl.evaluation.monte_carlo import mean_payoff
+from pirl_rl.initial_states import sample_interior
+from pirl_rl.simulator import Simulator
+from pirl_rl.solution import Solution
+
+
+class Calibration:
+    """V (masked) against the mean payoff of noise-free rollouts, at states uniform in the box outside A and B and
+    tau uniform in (0, T]: the same points and noise at every call.
+
+    Args:
+        points: states.
+        rollouts: paths from each, at least 2.
+        dt: control step, s.
+        substeps: integration steps in it.
+        crossing: how exits are watched.
+        seed: of points and noise.
+    """
+
+    def __init__(
+        self,
+        points: int = 256,
+        rollouts: int = 256,
+        dt: float = 0.1,
+        substeps: int = 1,
+        crossing: Literal["bridge", "endpoint"] = "bridge",
+        seed: int = 0,
+    ):
+        if points < 1 or rollouts < 2:
+            raise ValueError(f"Calibration: expected points >= 1 and rollouts >= 2, got {points} and {rollouts}")
+        self.points, self.rollouts, self.seed = points, rollouts, seed
+        self.simulator = partial(Simulator, dt=dt, substeps=substeps, crossing=crossing)
+
+    def __call__(self, solution: Solution) -> dict[str, float]:
+        """calibration_mse, calibration_mae, and calibration_noise, the part of the former that is Monte Carlo's own."""
+        problem, generator = solution.problem, torch.Generator().manual_seed(self.seed)
+        x = sample_interior(problem, problem.states, self.points, generator, solution.dtype).to(solution.device)
+        late = 1 - torch.rand(self.points, generator=generator, dtype=solution.dtype)
+        tau = problem.horizon * late.to(solution.device)
+        noise = torch.Generator(solution.device).manual_seed(self.seed)
+        mean = mean_payoff(self.simulator(problem), solution.policy, tau, x, self.rollouts, noise)
+        error = solution.value(tau, x) - mean
+        return {
+            "calibration_mse": error.square().mean().item(),
+            "calibration_mae": error.abs().mean().item(),
+            "calibration_noise": (mean * (1 - mean)).mean().item() / (self.rollouts - 1),
+        }

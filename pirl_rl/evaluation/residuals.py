@@ -1,0 +1,92 @@
+"""How well the raw V satisfies its equations at held-out points: HJB, boundary and one-step consistency."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from pirl_rl.collocation import BoundarySampler, Collocation
+from pirl_rl.initial_states import UniformStates
+from pirl_rl.simulator import Simulator, exit_value
+from pirl_rl.solution import Solution
+
+
+class Residuals:
+    """Mean squares of the residuals under the noise-free policy, at the same points and noise at every call.
+
+    - hjb_loss: (L^pi V)^2 at Sobol points of (0, T] x states outside A and B. A wrong policy can satisfy it.
+    - hjb_sup_loss: (max_u L^u V)^2 at the same points, the HJB equation itself, Eq. (hjb_pde): exposes a reversed
+      policy. The maximum is over a grid of controls and the policy's own.
+    - boundary_loss: (V - l_eps)^2, half of the points at tau = 0, half on the faces of A and B.
+    - td_loss: (V(y) - r - (1 - d) V(y'))^2 of one control step from x uniform and whole steps to go. The noise of the
+      step leaves the variance of V(y'), about |sigma^T grad V|^2 dt, even to the exact value.
+
+    Args:
+        points: of each of the samples.
+        controls_per_axis: grid of the maximum, vertices included: this to the power m evaluations.
+        dt: control step of the transitions, s.
+        substeps: integration steps in it.
+        crossing: how exits are watched.
+        seed: of points and noise.
+    """
+
+    def __init__(
+        self,
+        points: int = 4096,
+        controls_per_axis: int = 5,
+        dt: float = 0.1,
+        substeps: int = 1,
+        crossing: Literal["bridge", "endpoint"] = "bridge",
+        seed: int = 0,
+    ):
+        if points < 2 or controls_per_axis < 2:
+            raise ValueError(f"Residuals: expected points, controls_per_axis >= 2, got {points}, {controls_per_axis}")
+        self.points, self.controls_per_axis, self.seed = points, controls_per_axis, seed
+        self.simulator = partial(Simulator, dt=dt, substeps=substeps, crossing=crossing)
+
+    def __call__(self, solution: Solution) -> dict[str, float]:
+        generator = torch.Generator().manual_seed(self.seed)
+        along, largest = self._hjb(solution, generator)
+        losses = {
+            "hjb_loss": along,
+            "hjb_sup_loss": largest,
+            "boundary_loss": self._boundary(solution, generator),
+            "td_loss": self._td(solution, generator),
+        }
+        return {name: residual.square().mean().item() for name, residual in losses.items()}
+
+    def _hjb(self, solution: Solution, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        points = Collocation(solution.problem, self.points, sampler="sobol").sample(generator)
+        tau, x = _like(solution, points["tau"].squeeze(-1)[points["mask"]], points["state"][points["mask"]])
+        along = largest = solution.residual(tau, x)
+        axis = torch.linspace(-1, 1, self.controls_per_axis).to(tau)
+        for action in torch.cartesian_prod(*[axis] * solution.problem.controls.dim).view(
+            -1, solution.problem.controls.dim
+        ):
+            u = solution.problem.controls.denormalize(action).expand(len(x), -1)
+            largest = torch.maximum(largest, solution.residual(tau, x, u))
+        return along, largest
+
+    def _boundary(self, solution: Solution, generator: torch.Generator) -> Tensor:
+        half = self.points // 2
+        points = BoundarySampler(solution.problem, initial=self.points - half, faces=half).sample(generator)
+        tau, x, value = _like(solution, points["tau"].squeeze(-1), points["state"], points["value"])
+        return solution.raw_value(tau, x) - value
+
+    def _td(self, solution: Solution, generator: torch.Generator) -> Tensor:
+        problem, simulator = solution.problem, self.simulator(solution.problem)
+        max_steps = round(problem.horizon / simulator.dt)
+        steps, x = UniformStates().sample(problem, self.points, max_steps, generator, solution.dtype)
+        tau, tau_next, x = _like(solution, steps * simulator.dt, (steps - 1) * simulator.dt, x)
+        noise = torch.Generator(solution.device).manual_seed(self.seed)
+        step = simulator.step(x, solution.policy(tau, x), noise)
+        ended = step.reached | step.failed | (steps == 1).to(solution.device)
+        target = torch.where(ended, exit_value(problem, step), solution.raw_value(tau_next, step.state))
+        return solution.raw_value(tau, x) - target
+
+
+def _like(solution: Solution, *tensors: Tensor) -> tuple[Tensor, ...]:
+    return tuple(tensor.to(solution.device, solution.dtype) for tensor in tensors)

@@ -1,0 +1,152 @@
+"""The learner: one update of critics, actor and targets, Algorithm 1 of the paper, lines 7 to 13."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import warnings
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.objectives import SoftUpdate
+
+from pirl_rl.losses import PIRLLoss
+from pirl_rl.schedules import Schedule
+
+EXPLOSION = 1e6
+"""A critic loss above this is a divergence: probabilities err by at most 1, and residuals of interest are far below."""
+
+
+class DivergenceError(RuntimeError):
+    """A loss became NaN, infinite or exploded; the message names the update and the term."""
+
+
+class Learner:
+    """Optimises a loss.
+
+    Args:
+        loss: critics, actor and their targets.
+        schedule: weights of the critic terms by update.
+        learning_rate: Adam's rate at the first update, for critics and actor.
+        decay: "cosine" lets the rate fall to zero along a quarter wave, "constant" keeps it.
+        actor_every: critic updates for each update of the actor and the targets (d_up).
+        polyak: rate of the targets.
+        compile: compile both losses; without a C++ compiler on the CPU they run eagerly after one warning.
+    """
+
+    def __init__(
+        self,
+        loss: PIRLLoss,
+        schedule: Schedule,
+        learning_rate: float = 1e-3,
+        decay: Literal["cosine", "constant"] = "cosine",
+        actor_every: int = 2,
+        polyak: float = 0.005,
+        compile: bool = True,
+    ):
+        if decay not in ("cosine", "constant"):
+            raise ValueError(f"learner.decay: expected 'cosine' or 'constant', got {decay!r}")
+        if not learning_rate > 0 or actor_every < 1 or not 0 < polyak <= 1:
+            raise ValueError(
+                "learner: expected learning_rate > 0, actor_every >= 1 and 0 < polyak <= 1, "
+                f"got {learning_rate}, {actor_every} and {polyak}"
+            )
+        self.loss, self.schedule = loss, schedule
+        self.learning_rate, self.decay, self.actor_every = learning_rate, decay, actor_every
+        self.targets = SoftUpdate(loss, tau=polyak)
+        self.critic_optimizer = _adam(loss.qvalue_network_params, learning_rate)
+        self.actor_optimizer = _adam(loss.actor_network_params, learning_rate)
+        device = next(loss.parameters()).device
+        compile = compile and _can_compile(device)
+        self.critic_loss = torch.compile(loss.critic_loss) if compile else loss.critic_loss
+        self.actor_loss = torch.compile(loss.actor_loss) if compile else loss.actor_loss
+
+    def update(self, batch: TensorDictBase, k: int, progress: float) -> dict[str, Tensor]:
+        """The k-th update (from 0) on {"replay", "collocation", "boundary"}; returns the unweighted terms.
+
+        Args:
+            progress: k as a fraction of the run, for the learning rate.
+
+        Raises:
+            DivergenceError: before the step that would have spoilt the networks.
+        """
+        self._set_weights_and_rate(k, progress)
+        loss, terms = self.critic_loss(batch)
+        self._check(loss, terms, k)
+        self._step(self.critic_optimizer, loss)
+        if k % self.actor_every == 0:
+            loss_actor, _ = self.actor_loss(batch)
+            self._check(loss_actor, {"loss_actor": loss_actor}, k)
+            self._step(self.actor_optimizer, loss_actor)
+            self.targets.step()
+            terms = {**terms, "loss_actor": loss_actor.detach()}
+        return terms
+
+    def weights_and_rate(self, k: int, progress: float) -> dict[str, float]:
+        """The loss weights and the learning rate of the k-th update."""
+        td, hjb, boundary = self.schedule(k)
+        fraction = 1.0 if self.decay == "constant" else (1 + math.cos(math.pi * min(progress, 1.0))) / 2
+        return {
+            "td_weight": td,
+            "hjb_weight": hjb,
+            "boundary_weight": boundary,
+            "learning_rate": self.learning_rate * fraction,
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "loss": self.loss.state_dict(),
+            "critic_optimizer": self.critic_optimizer.state_dict(),
+            "actor_optimizer": self.actor_optimizer.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.loss.load_state_dict(state["loss"])
+        self.critic_optimizer.load_state_dict(state["critic_optimizer"])
+        self.actor_optimizer.load_state_dict(state["actor_optimizer"])
+
+    def _set_weights_and_rate(self, k: int, progress: float) -> None:
+        values = self.weights_and_rate(k, progress)
+        rate = values.pop("learning_rate")
+        for name, value in values.items():
+            setattr(self.loss, name, value)
+        for optimizer in (self.critic_optimizer, self.actor_optimizer):
+            optimizer.param_groups[0]["lr"] = rate
+
+    @staticmethod
+    def _step(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+
+    @staticmethod
+    def _check(loss: Tensor, terms: dict[str, Tensor], k: int) -> None:
+        if abs(loss.item()) < EXPLOSION:
+            return
+        found = ", ".join(f"{name} = {term.item():.3g}" for name, term in terms.items())
+        worst = max(terms, key=lambda name: math.inf if math.isnan(value := terms[name].item()) else abs(value))
+        raise DivergenceError(f"update {k}: {worst} is not finite or exploded (above {EXPLOSION:.0e}): {found}")
+
+
+def _adam(params, rate: float) -> torch.optim.Adam:
+    return torch.optim.Adam(list(params.parameters()), rate, fused=True)
+
+
+def _can_compile(device: torch.device) -> bool:
+    if device.type != "cpu":
+        return True
+    from torch._inductor import config, exc
+    from torch._inductor.cpp_builder import get_cpp_compiler
+
+    try:
+        found = shutil.which(get_cpp_compiler())
+    except exc.InvalidCxxCompiler:
+        found = None
+    if found is None:
+        names = ", ".join(str(name) for name in config.cpp.cxx if name)
+        warnings.warn(
+            f"no C++ compiler found (tried {names}): the update runs eagerly, two to three times slower", stacklevel=2
+        )
+    return found is not None

@@ -1,0 +1,124 @@
+"""Loggers: where the rows of metrics go. `metrics.csv` is what figures, comparisons and resuming read."""
+
+from __future__ import annotations
+
+import csv
+import netrc
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+from torchrl.record.loggers import get_logger
+
+METRICS_FILE = "metrics.csv"
+
+
+class MetricsLogger(Protocol):
+    """Takes a row of numbers for an update."""
+
+    def open(self, folder: Path, config: Mapping[str, Any]) -> None:
+        """Begin, or go on, in a run directory."""
+
+    def log(self, row: Mapping[str, float]) -> None: ...
+
+    def rewind(self, update: int) -> None:
+        """Forget rows after an update: a resumed run writes them again."""
+
+    def close(self) -> None: ...
+
+
+class CSVLogger:
+    """One row an update in `metrics.csv`; its columns are those of the first row, cells may stay empty."""
+
+    def open(self, folder: Path, config: Mapping[str, Any]) -> None:
+        self.path = folder / METRICS_FILE
+        self.columns = self._read()[0]
+
+    def log(self, row: Mapping[str, float]) -> None:
+        new = not self.columns
+        self.columns = self.columns or list(row)
+        with self.path.open("a", newline="") as file:
+            writer = csv.DictWriter(file, self.columns, extrasaction="ignore")
+            if new:
+                writer.writeheader()
+            writer.writerow({key: f"{value:.9g}" for key, value in row.items()})
+
+    def rewind(self, update: int) -> None:
+        columns, rows = self._read()
+        if not columns:
+            return
+        draft = self.path.with_suffix(".draft")
+        with draft.open("w", newline="") as file:
+            writer = csv.DictWriter(file, columns)
+            writer.writeheader()
+            # A row cut short by a kill has no update, or one that comes again.
+            writer.writerows(row for row in rows if (row["update"] or "").isdigit() and int(row["update"]) <= update)
+        os.replace(draft, self.path)
+
+    def close(self) -> None:
+        pass
+
+    def _read(self) -> tuple[list[str], list[dict[str, str]]]:
+        if not self.path.is_file():
+            return [], []
+        with self.path.open(newline="") as file:
+            reader = csv.DictReader(file)
+            return list(reader.fieldnames or []), list(reader)
+
+
+class TorchRLLogger(CSVLogger):
+    """One of TorchRL's loggers beside `metrics.csv`.
+
+    Args:
+        kind: "wandb" (offline where neither WANDB_API_KEY nor a netrc entry names an account) or "tensorboard".
+        project: name of the W&B project.
+    """
+
+    def __init__(self, kind: Literal["wandb", "tensorboard"], project: str = "pirl_rl"):
+        self.kind, self.project = kind, project
+
+    def open(self, folder: Path, config: Mapping[str, Any]) -> None:
+        super().open(folder, config)
+        extra = {}
+        if self.kind == "wandb":
+            offline = "WANDB_MODE" not in os.environ and not _has_wandb_account()
+            extra = {"wandb_kwargs": {"project": self.project, "offline": offline, "config": dict(config)}}
+        self.logger = get_logger(self.kind, logger_name=str(folder), experiment_name=folder.name, **extra)
+
+    def log(self, row: Mapping[str, float]) -> None:
+        super().log(row)
+        for name, value in row.items():
+            if name != "update":
+                self.logger.log_scalar(name, value, step=int(row["update"]))
+
+    def close(self) -> None:
+        if self.kind == "wandb":
+            self.logger.experiment.finish()
+        else:
+            self.logger.experiment.close()
+
+
+class NoLogger:
+    """Keeps nothing; the run has no curves."""
+
+    def open(self, folder: Path, config: Mapping[str, Any]) -> None:
+        pass
+
+    def log(self, row: Mapping[str, float]) -> None:
+        pass
+
+    def rewind(self, update: int) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+def _has_wandb_account() -> bool:
+    if os.environ.get("WANDB_API_KEY"):
+        return True
+    try:
+        return any("wandb" in host for host in netrc.netrc().hosts)
+    except (OSError, netrc.NetrcParseError):
+        return False

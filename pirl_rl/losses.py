@@ -1,0 +1,203 @@
+"""The PIRL loss, Sec. IV-A of the paper: temporal differences, the HJB residual and the boundary in one module.
+
+    L_critic = sum_i  w_TD L_TD,i + w_HJB L_PDE,i + w_BC L_BC,i                     Eq. (critic_loss)
+
+over the critics i. The derivatives are those of Q(tau, x, u) with u frozen at the target actor's output. The weights
+are buffers: `loss.hjb_weight = 0.3` moves one in place, compiled code included, and a checkpoint keeps it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.objectives import TD3Loss
+
+from pirl_rl.networks import Actor, Critic
+from pirl_rl.operators import generator, require_twice_differentiable
+from pirl_rl.problem import ReachAvoidProblem
+
+WEIGHTS = ("td_weight", "hjb_weight", "boundary_weight")
+
+
+class PIRLLoss(TD3Loss):
+    """TD3 targets with collocation HJB and boundary terms.
+
+    `forward` takes a TensorDict with "replay" (transitions), and where the physics is wanted "collocation" (tau, state,
+    mask) and "boundary" (tau, state, value); it returns "loss_qvalue" and "loss_actor", each named by its optimiser,
+    and the unweighted "td_loss", "hjb_loss", "boundary_loss", summed over the critics.
+
+    Args:
+        problem: the physics.
+        actor: pi(tau, x).
+        critics: two for TD3; one, with `policy_noise=0`, is DDPG's critic rule.
+        policy_noise: deviation of the target policy's smoothing noise, in [-1, 1] coordinates of the control.
+        noise_clip: bound of that noise.
+        hjb_noise: deviation of the noise on the action of the HJB residual; biases V low, 0 by default.
+        hjb_noise_clip: bound of that noise.
+        actor_rule: "q" ascends Q_1(y, pi(y)), Eq. (actor_loss); "hamiltonian" ascends f(x, pi) . grad V +
+            1/2 Tr(sigma sigma^T hess V) at fixed V, the HJB equation's own rule; "both" adds them.
+        td_weight, hjb_weight, boundary_weight: initial weights of the three terms.
+
+    Raises:
+        ValueError: an unknown actor rule.
+        TypeError: a critic with an activation that is not C^2.
+    """
+
+    _schedulable_buffers = frozenset(WEIGHTS)
+
+    def __init__(
+        self,
+        problem: ReachAvoidProblem,
+        actor: Actor,
+        critics: Sequence[Critic],
+        *,
+        policy_noise: float = 0.2,
+        noise_clip: float = 0.5,
+        hjb_noise: float = 0.0,
+        hjb_noise_clip: float = 1.0,
+        actor_rule: Literal["q", "hamiltonian", "both"] = "both",
+        td_weight: float = 1.0,
+        hjb_weight: float = 0.0,
+        boundary_weight: float = 0.0,
+    ):
+        if actor_rule not in ("q", "hamiltonian", "both"):
+            raise ValueError(f"loss.actor_rule: expected 'q', 'hamiltonian' or 'both', got {actor_rule!r}")
+        for critic in critics:
+            require_twice_differentiable(critic.layers)
+        one = torch.ones(problem.controls.dim)
+        super().__init__(
+            TensorDictModule(actor, in_keys=["tau", "state"], out_keys=["action"]),
+            [
+                TensorDictModule(critic, in_keys=["tau", "state", "action"], out_keys=["state_action_value"])
+                for critic in critics
+            ],  # type: ignore[arg-type]
+            bounds=(-one, one),  # type: ignore[arg-type]
+            num_qvalue_nets=len(critics),
+            policy_noise=policy_noise,
+            noise_clip=noise_clip,
+            loss_function="l2",
+        )
+        self.make_value_estimator(gamma=1.0)
+        self.problem = problem
+        self.hjb_noise, self.hjb_noise_clip, self.actor_rule = hjb_noise, hjb_noise_clip, actor_rule
+        for name, value in zip(WEIGHTS, (td_weight, hjb_weight, boundary_weight), strict=True):
+            self.register_coeff_buffer(name, float(value))
+
+    def critic_loss(self, batch: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """The weighted critic loss and its unweighted parts; each term is there if its part of the batch is."""
+        replay = batch["replay"]
+        # TD3Loss draws its smoothing noise first; so do we, for the same stream.
+        noise = self._clipped_noise(replay["action"], self.policy_noise, self.noise_clip)
+        parts = {"td_loss": self._td_loss(replay, noise)}
+        loss = self.td_weight * parts["td_loss"]
+        if "collocation" in batch.keys():
+            parts["hjb_loss"] = self._hjb_loss(batch["collocation"])
+            loss = loss + self.hjb_weight * parts["hjb_loss"]
+        if "boundary" in batch.keys():
+            parts["boundary_loss"] = self._boundary_loss(batch["boundary"])
+            loss = loss + self.boundary_weight * parts["boundary_loss"]
+        return loss, {name: part.detach() for name, part in parts.items()}
+
+    def actor_loss(self, batch: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """The actor's loss by its rule; no gradient reaches the critics."""
+        replay = batch["replay"]
+        loss = replay["tau"].new_zeros(())
+        if self.actor_rule != "hamiltonian":
+            action = self.act(replay["tau"], replay["state"])
+            with self.critics("frozen") as critic:
+                loss = loss - critic(replay["tau"], replay["state"], action)[0].mean()
+        if self.actor_rule != "q":
+            points = batch["collocation"] if "collocation" in batch.keys() else replay
+            loss = loss - self._hamiltonian(points)
+        return loss, {}
+
+    def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """TD3Loss's name for `critic_loss`."""
+        return self.critic_loss(tensordict)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        loss_actor, _ = self.actor_loss(tensordict)
+        loss_qvalue, parts = self.critic_loss(tensordict)
+        return TensorDict({"loss_actor": loss_actor, "loss_qvalue": loss_qvalue, **parts})
+
+    def act(self, tau: Tensor, state: Tensor, target: bool = False) -> Tensor:
+        """The (target) actor's output: (N, 1), (N, n) -> (N, m) in [-1, 1]."""
+        params = self.target_actor_network_params if target else self.actor_network_params
+        with params.to_module(self.actor_network, preserve_module_state=False):
+            return self.actor_network.module(tau, state)
+
+    @contextmanager
+    def critics(self, kind: Literal["online", "frozen", "target"] = "online") -> Iterator[Critic]:
+        """The critic module with the stacked parameters of all critics in place, (critics, N, 1) from one call.
+
+        Args:
+            kind: "online" parameters take gradients, "frozen" are the same without, "target" the Polyak averages.
+        """
+        if kind == "target":
+            params = self.target_qvalue_network_params
+        else:
+            params = self.qvalue_network_params if kind == "online" else self.qvalue_network_params.data
+        with params.to_module(self.qvalue_network, preserve_module_state=False):
+            yield self.qvalue_network.module
+
+    def residuals(self, tau: Tensor, x: Tensor, action: Tensor, u: Tensor) -> Tensor:
+        """L^u Q_i(., action) (critics, N): tau (N,), x (N, n), the critics' frozen action and the physical u (N, m)."""
+        with self.critics() as critic:
+            return generator(critic.at(action), self.problem, tau, x, u)
+
+    def _td_loss(self, replay: TensorDictBase, noise: Tensor) -> Tensor:
+        """L_TD summed over critics: (Q_i - r - (1 - d) min_j Q_j^-(y', pi^-(y') + noise))^2."""
+        following = replay["next"]
+        with torch.no_grad():
+            action = (self.act(following["tau"], following["state"], target=True) + noise).clamp(-1, 1)
+            with self.critics("target") as critic:
+                value = critic(following["tau"], following["state"], action).amin(0)
+            target = following["reward"] + (~following["terminated"]) * value
+        with self.critics() as critic:
+            value = critic(replay["tau"], replay["state"], replay["action"])
+        return (value - target).square().squeeze(-1).sum(0).mean()
+
+    def _hjb_loss(self, points: TensorDictBase) -> Tensor:
+        """L_PDE summed over critics: the mean of (L^u Q_i)^2 over unmasked points, u = pi^-(y) + noise."""
+        with torch.no_grad():
+            action = self.act(points["tau"], points["state"], target=True)
+            if self.hjb_noise:
+                action = (action + self._clipped_noise(action, self.hjb_noise, self.hjb_noise_clip)).clamp(-1, 1)
+            u = self.problem.controls.denormalize(action)
+        residual = self.residuals(points["tau"].squeeze(-1), points["state"], action, u)
+        return _masked_mean(residual.square().sum(0), points["mask"])
+
+    def _boundary_loss(self, points: TensorDictBase) -> Tensor:
+        """L_BC summed over critics: the mean of (Q_i(y, pi^-(y)) - l_eps)^2."""
+        with torch.no_grad():
+            action = self.act(points["tau"], points["state"], target=True)
+        with self.critics() as critic:
+            value = critic(points["tau"], points["state"], action).squeeze(-1)
+        return (value - points["value"]).square().sum(0).mean()
+
+    def _hamiltonian(self, points: TensorDictBase) -> Tensor:
+        """Mean over points of f(x, u) . grad V + 1/2 Tr(sigma sigma^T hess V) and a term without u, Eq. (generator).
+
+        V is the mean critic at the frozen action; u is the actor's output with its gradient.
+        """
+        tau, x = points["tau"], points["state"]
+        action = self.act(tau, x)
+        u = self.problem.controls.denormalize(action)
+        with self.critics("frozen") as critic:
+            value = generator(critic.at(action.detach()), self.problem, tau.squeeze(-1), x, u).mean(0)
+        mask = points["mask"] if "mask" in points.keys() else torch.ones_like(value, dtype=torch.bool)
+        return _masked_mean(value, mask)
+
+    @staticmethod
+    def _clipped_noise(like: Tensor, deviation: float, bound: float) -> Tensor:
+        return (torch.randn_like(like) * deviation).clamp(-bound, bound)
+
+
+def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    return (values * mask).sum() / mask.sum().clamp(min=1)

@@ -1,0 +1,159 @@
+"""Runs: a trainer from a configuration, and a finished run from its directory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from pirl_rl import checkpoint
+from pirl_rl.configuration import build, load_config
+from pirl_rl.envs import ReachAvoidEnv
+from pirl_rl.losses import PIRLLoss
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.simulator import Simulator
+from pirl_rl.solution import Solution
+from pirl_rl.trainer import Trainer
+
+
+def pick_device(name: str) -> torch.device:
+    """ "auto" is CUDA where there is one."""
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    return torch.device(name)
+
+
+def make_loss(config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[str] = ()) -> PIRLLoss:
+    """Fresh networks in their loss."""
+    actor = build(config.actor, "actor", trust, problem=problem)
+    critics = [build(config.critic, "critic", trust, problem=problem) for _ in range(config.critics)]
+    return build(config.loss, "loss", trust, problem=problem, actor=actor, critics=critics).to(
+        pick_device(config.device)
+    )
+
+
+def make_trainer(config: DictConfig, folder: Path | None = None, trust: Sequence[str] = ()) -> Trainer:
+    """Everything a configuration names, put together; nothing is written yet.
+
+    Raises:
+        ConfigError: naming the key, what was expected and what was got.
+    """
+    device = pick_device(config.device)
+    torch.manual_seed(config.seed)
+    env: ReachAvoidEnv = build(config.env, "env", trust, seed=config.seed, device=device)
+    problem = env.problem
+    loss = make_loss(config, problem, trust)
+    schedule = build(config.schedule, "schedule", trust)
+    learner = build(config.learner, "learner", trust, loss=loss, schedule=schedule)
+    actor = loss.actor_network.module
+    evaluation = config.evaluation
+    return build(
+        config.trainer,
+        "trainer",
+        trust,
+        learner=learner,
+        collector=build(config.collector, "collector", trust, env=env, actor=actor, seed=config.seed),
+        collocation=build(config.collocation, "collocation", trust, problem=problem),
+        boundary=build(config.boundary, "boundary", trust, problem=problem),
+        during=[build(evaluation[name], f"evaluation.{name}", trust) for name in evaluation.during],
+        final=[build(evaluation[name], f"evaluation.{name}", trust) for name in evaluation.final],
+        logger=build(config.logger, "logger", trust),
+        folder=folder,
+        config=OmegaConf.to_container(config, resolve=True),
+        seed=config.seed,
+    )
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """Closed-loop paths: `tau` (K + 1, N), `state` (K + 1, N, n), held after the end; `reached`, `failed` (N,) bool."""
+
+    tau: Any
+    state: Any
+    reached: Any
+    failed: Any
+
+
+class Run:
+    """A trained solution. Numpy arrays in, numpy arrays out; torch tensors in, torch tensors out.
+
+    Attributes:
+        problem: the physics.
+        solution: the networks, in torch.
+        config: the run's configuration.
+        update: how far it was trained.
+    """
+
+    def __init__(self, solution: Solution, config: DictConfig, update: int):
+        self.solution, self.problem, self.config, self.update = solution, solution.problem, config, update
+
+    def value(self, tau, x):
+        """V(tau, x), exactly 1 in A and 0 in B: tau (N,) or a number, s; x (N, n), SI."""
+        return self._call(self.solution.value, tau, x)
+
+    def policy(self, tau, x):
+        """The control (N, m) in SI units."""
+        return self._call(self.solution.policy, tau, x)
+
+    def reach_avoid_set(self, p: float, tau: float) -> Callable:
+        """The set {x : V(tau, x) > p} as a function of states (N, n) to (N,) bool, Eq. (ra_levelset)."""
+        return lambda x: self.value(tau, x) > p
+
+    def simulate(self, tau: float, x, dt: float = 0.01, substeps: int = 1, crossing: str = "bridge", seed: int = 0):
+        """Closed-loop paths from states (N, n) over the time tau under the learned policy, as `Trajectories`."""
+        simulator = Simulator(self.problem, dt, substeps, crossing)  # type: ignore[arg-type]
+        state, wrap = _tensor(x, self.solution)
+        rng = torch.Generator(state.device).manual_seed(seed)
+        reached, failed = self.problem.reached(state), self.problem.failed(state)
+        times, states = [torch.full(state.shape[:1], float(tau)).to(state)], [state]
+        for left in range(round(tau / dt), 0, -1):
+            now = torch.full_like(times[0], left * dt)
+            step = simulator.step(state, self.solution.policy(now, state), rng)
+            active = ~(reached | failed)
+            state = torch.where(active.unsqueeze(-1), step.state, state)
+            reached, failed = reached | (active & step.reached), failed | (active & step.failed)
+            times.append(now - dt)
+            states.append(state)
+        return Trajectories(wrap(torch.stack(times)), wrap(torch.stack(states)), wrap(reached), wrap(failed))
+
+    def _call(self, function, tau, x):
+        state, wrap = _tensor(x, self.solution)
+        time = torch.as_tensor(tau, dtype=state.dtype, device=state.device).expand(state.shape[:-1])
+        return wrap(function(time.reshape(-1), state.reshape(-1, state.shape[-1])).unflatten(0, state.shape[:-1]))
+
+
+def _tensor(x, solution: Solution) -> tuple[Tensor, Callable]:
+    """The states as the networks want them, and how to give an answer back in the caller's kind."""
+    state = torch.as_tensor(x, dtype=solution.dtype, device=solution.device)
+    if isinstance(x, Tensor):
+        return state, lambda answer: answer.to(x.device)
+    return state, lambda answer: np.asarray(answer.cpu())
+
+
+def load_run(folder: str | Path, trust: Sequence[str] = (), weights: str = checkpoint.LAST, device: str = "cpu") -> Run:
+    """Open a run directory.
+
+    Args:
+        folder: as `train` left it.
+        trust: modules outside pirl_rl that its configuration may name, e.g. your own problem's.
+        weights: file in `checkpoints/`.
+        device: where the networks go.
+
+    Raises:
+        ConfigError: not a run directory, or a configuration that names code from elsewhere.
+        CheckpointError: no checkpoint, or a broken one.
+    """
+    folder = Path(folder)
+    config = load_config(folder)
+    config.device = device
+    problem = build(config.env.problem, "env.problem", trust)
+    loss = make_loss(config, problem, trust)
+    state = checkpoint.load(folder / "checkpoints" / weights, pick_device(device))
+    loss.load_state_dict(state.get("learner", state)["loss"])
+    return Run(Solution(loss), config, state["update"])

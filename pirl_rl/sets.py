@@ -1,0 +1,114 @@
+"""Boxes and the algebra of level sets.
+
+A closed set S is written as a level function g with S = {x : g(x) <= 0}: one function gives membership, the crossing of
+the boundary between two time steps, and contours. Levels have shape (*) where states have shape (*, n).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+
+class Box:
+    """The box {x : low <= x <= high} in R^n, in the units of the problem.
+
+    Args:
+        low: lower corner, n finite numbers.
+        high: upper corner, n finite numbers, each above its lower one.
+
+    Raises:
+        ValueError: corners of different lengths, empty, not finite or not ordered.
+    """
+
+    def __init__(self, low: Sequence[float], high: Sequence[float]):
+        self.low = tuple(float(value) for value in low)
+        self.high = tuple(float(value) for value in high)
+        if len(self.low) != len(self.high) or not self.low:
+            raise ValueError(f"Box: low and high need the same length >= 1, got {len(self.low)} and {len(self.high)}")
+        for axis, (a, b) in enumerate(zip(self.low, self.high, strict=True)):
+            if not (math.isfinite(a) and math.isfinite(b) and a < b):
+                raise ValueError(f"Box: axis {axis} needs finite low < high, got low={a}, high={b}")
+        self._cache: dict[tuple[torch.dtype, torch.device], tuple[Tensor, Tensor]] = {}
+
+    @property
+    def dim(self) -> int:
+        return len(self.low)
+
+    def center_and_half_width(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Center and half width, each (n,), in the dtype and on the device of `like`."""
+        key = (like.dtype, like.device)
+        if key not in self._cache:
+            low, high = (torch.tensor(corner, dtype=like.dtype, device=like.device) for corner in (self.low, self.high))
+            self._cache[key] = ((low + high) / 2, (high - low) / 2)
+        return self._cache[key]
+
+    def normalize(self, x: Tensor) -> Tensor:
+        """Physical (*, n) to [-1, 1] coordinates; points outside the box map outside [-1, 1]."""
+        center, half_width = self.center_and_half_width(x)
+        return (x - center) / half_width
+
+    def denormalize(self, z: Tensor) -> Tensor:
+        """[-1, 1] coordinates (*, n) to physical."""
+        center, half_width = self.center_and_half_width(z)
+        return center + half_width * z
+
+    def contains(self, x: Tensor) -> Tensor:
+        """Membership (*) of points (*, n)."""
+        return (self.normalize(x).abs() <= 1).all(-1)
+
+    def sample(
+        self,
+        count: int,
+        generator: torch.Generator | None = None,
+        dtype: torch.dtype | None = None,
+        device: torch.device | str | None = None,
+    ) -> Tensor:
+        """Uniform points (count, n)."""
+        unit = torch.rand(count, self.dim, generator=generator, dtype=dtype, device=device)
+        return self.denormalize(2 * unit - 1)
+
+    def expand(self, factor: float) -> Box:
+        """The box of the same center whose widths are `factor` times as large."""
+        middle = [(a + b) / 2 for a, b in zip(self.low, self.high, strict=True)]
+        half = [factor * (b - a) / 2 for a, b in zip(self.low, self.high, strict=True)]
+        return Box(
+            [m - h for m, h in zip(middle, half, strict=True)], [m + h for m, h in zip(middle, half, strict=True)]
+        )
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Box) and (self.low, self.high) == (other.low, other.high)
+
+    def __hash__(self) -> int:
+        return hash((self.low, self.high))
+
+    def __repr__(self) -> str:
+        return f"Box({list(self.low)}, {list(self.high)})"
+
+
+def union(*levels: Tensor) -> Tensor:
+    """Level of the union of sets, from their levels."""
+    return torch.stack(levels).amin(0)
+
+
+def intersection(*levels: Tensor) -> Tensor:
+    """Level of the intersection of sets, from their levels."""
+    return torch.stack(levels).amax(0)
+
+
+def complement(level: Tensor) -> Tensor:
+    """Level of the (closed) complement of a set, from its level."""
+    return -level
+
+
+def difference(level: Tensor, other: Tensor) -> Tensor:
+    """Level of the first set without the second, from their levels."""
+    return intersection(level, complement(other))
+
+
+def band(value: Tensor, center: Tensor | float, half_width: float) -> Tensor:
+    """Level of {|value - center| <= half_width}."""
+    return (value - center).abs() - half_width

@@ -1,0 +1,125 @@
+"""One control step of the SDE, with its exits.
+
+Three step sizes stay apart: how long a control is held (dt), how finely the SDE is integrated (dt / substeps, by
+Euler-Maruyama), and how exits are watched (crossing):
+
+- "endpoint": an exit is seen only where a sub-step ends.
+- "bridge": between the ends of a sub-step the path is a Brownian bridge, which crosses a smooth face g = 0 with
+  probability exp(-2 g0 g1 / (|sigma^T grad g|^2 h)), g0 and g1 the levels at both ends: exact for constant
+  coefficients and a flat face (Gobet 2000), sigma frozen at the start of the sub-step. A face of a target with corners
+  counts only where all its other constraints hold at both ends.
+
+A sub-step that shows both exits counts as a failure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from pirl_rl.problem import ReachAvoidProblem
+
+
+class Step(NamedTuple):
+    """State after the step (*, n), held where a path ended; `reached` and `failed`, (*) bool, never both."""
+
+    state: Tensor
+    reached: Tensor
+    failed: Tensor
+
+
+def exit_value(problem: ReachAvoidProblem, step: Step) -> Tensor:
+    """Payoff (N,) of paths that end with this step: 1 where it reached, 0 where it failed, else l_eps of the state."""
+    payoff = torch.where(step.reached, torch.ones_like(step.state[..., 0]), problem.boundary_value(step.state))
+    return torch.where(step.failed, torch.zeros_like(payoff), payoff)
+
+
+@dataclass(frozen=True)
+class Simulator:
+    """Integrates a problem over one control step.
+
+    Args:
+        problem: the physics.
+        dt: how long a control is held, s.
+        substeps: integration steps in it.
+        crossing: how exits are watched.
+
+    Raises:
+        ValueError: dt not in (0, horizon], substeps < 1, an unknown crossing rule.
+    """
+
+    problem: ReachAvoidProblem
+    dt: float = 0.1
+    substeps: int = 1
+    crossing: Literal["bridge", "endpoint"] = "bridge"
+
+    def __post_init__(self):
+        if not 0 < self.dt <= self.problem.horizon:
+            raise ValueError(f"dt: expected 0 < dt <= horizon = {self.problem.horizon}, got {self.dt}")
+        if not (isinstance(self.substeps, int) and self.substeps >= 1):
+            raise ValueError(f"substeps: expected an integer >= 1, got {self.substeps!r}")
+        if self.crossing not in ("bridge", "endpoint"):
+            raise ValueError(f"crossing: expected 'bridge' or 'endpoint', got {self.crossing!r}")
+
+    @torch.no_grad()
+    def step(self, x: Tensor, u: Tensor, generator: torch.Generator | None = None, dt: Tensor | None = None) -> Step:
+        """Advance paths that are outside A and B by one control step.
+
+        Args:
+            x: states (N, n).
+            u: physical controls (N, m), held.
+            generator: source of the noise.
+            dt: lengths (N,) of this step where they differ between paths; default `self.dt`.
+        """
+        h = (x.new_tensor(self.dt) if dt is None else dt) / self.substeps
+        reached = torch.zeros(x.shape[:-1], dtype=torch.bool, device=x.device)
+        failed = reached
+        for index in range(self.substeps):
+            moved, sigma = self._euler_maruyama(x, u, h, generator)
+            now_reached, now_failed = self._exits(x, moved, sigma, h, generator)
+            if index == 0:
+                x, reached, failed = moved, now_reached & ~now_failed, now_failed
+                continue
+            active = ~(reached | failed)
+            x = torch.where(active.unsqueeze(-1), moved, x)
+            failed = failed | (active & now_failed)
+            reached = reached | (active & now_reached & ~now_failed)
+        return Step(x, reached, failed)
+
+    def _euler_maruyama(self, x: Tensor, u: Tensor, h: Tensor, generator) -> tuple[Tensor, Tensor]:
+        sigma = self.problem.diffusion(x, u)
+        noise = (
+            torch.randn((*x.shape[:-1], 1, sigma.shape[-1]), generator=generator, dtype=x.dtype, device=x.device)
+            * torch.sqrt(h)[..., None, None]
+        )
+        return x + self.problem.drift(x, u) * h[..., None] + (sigma * noise).sum(-1), sigma
+
+    def _exits(self, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor, generator) -> tuple[Tensor, Tensor]:
+        problem = self.problem
+        reached, failed = problem.reached(moved), problem.failed(moved)
+        if self.crossing == "endpoint":
+            return reached, failed
+        if problem.objective == "reach-avoid":
+            crossed, others_hold = self._crossed(problem.reached_constraints, x, moved, sigma, h, generator)
+            reached = reached | (crossed & others_hold).any(-1)
+        if problem.has_avoid_set:
+            crossed, _ = self._crossed(problem.avoid_constraints, x, moved, sigma, h, generator)
+            failed = failed | crossed.any(-1)
+        return reached, failed
+
+    @staticmethod
+    def _crossed(constraints, x, moved, sigma, h, generator) -> tuple[Tensor, Tensor]:
+        """For each face (N, k): did the bridge cross it, and do all other constraints hold at both ends?"""
+        before, after = constraints(x), constraints(moved)
+        columns = [torch.func.jvp(constraints, (x,), (column,))[1] for column in sigma.unbind(-1)]
+        variance = torch.stack([column**2 for column in columns]).sum(0) * h[..., None]
+        exponent = -2 * before * after / variance
+        # 0/0 and inf/0: a face along which the noise does not act is not crossed between the ends.
+        probability = torch.where((variance > 0) & (before > 0) & (after > 0), exponent.exp(), torch.zeros_like(before))
+        crossed = torch.rand(before.shape, generator=generator, dtype=x.dtype, device=x.device) < probability
+        held = (before <= 0) & (after <= 0)
+        others_hold = held.sum(-1, keepdim=True) - held.long() == before.shape[-1] - 1
+        return crossed, others_hold

@@ -1,0 +1,244 @@
+"""The trainer: collect, sample, update, log, evaluate, checkpoint, in one loop that reads top to bottom."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from tqdm import tqdm
+
+from pirl_rl import checkpoint
+from pirl_rl.collectors import TransitionCollector
+from pirl_rl.collocation import BoundarySampler, Collocation
+from pirl_rl.evaluation import evaluate
+from pirl_rl.learner import Learner
+from pirl_rl.loggers import MetricsLogger, NoLogger
+from pirl_rl.solution import Solution
+
+Evaluator = Callable[[Solution], dict[str, float]]
+SHOWN = ("value_mse", "success_rate", "hjb_loss")
+
+
+class Interrupted(Exception):
+    """Training was asked to stop; everything is saved."""
+
+    def __init__(self, update: int):
+        super().__init__(f"stopped at update {update}")
+        self.update = update
+
+
+class Trainer:
+    """Trains a learner and leaves the evidence in a run directory.
+
+    Args:
+        learner: the update.
+        collector: fills the replay buffer.
+        collocation, boundary: samplers of the physics.
+        updates: critic updates of the whole run.
+        batch_size: transitions an update.
+        log_every: updates between rows of metrics.
+        evaluate_every: updates between evaluations during training; 0 for none.
+        checkpoint_every: updates between checkpoints; 0 for the last one only.
+        during, final: evaluators during and after training.
+        logger: where rows go.
+        folder: the run directory; None keeps everything in memory.
+        config: what made this run, for loggers.
+        seed: of the sampling of points.
+    """
+
+    def __init__(
+        self,
+        learner: Learner,
+        collector: TransitionCollector,
+        collocation: Collocation,
+        boundary: BoundarySampler,
+        updates: int = 20_000,
+        batch_size: int = 256,
+        log_every: int = 100,
+        evaluate_every: int = 2_000,
+        checkpoint_every: int = 5_000,
+        during: Sequence[Evaluator] = (),
+        final: Sequence[Evaluator] = (),
+        logger: MetricsLogger | None = None,
+        folder: Path | str | None = None,
+        config: Mapping[str, Any] | None = None,
+        seed: int = 0,
+    ):
+        for name, value, least in (
+            ("updates", updates, 1),
+            ("batch_size", batch_size, 1),
+            ("log_every", log_every, 1),
+            ("evaluate_every", evaluate_every, 0),
+            ("checkpoint_every", checkpoint_every, 0),
+        ):
+            if not (isinstance(value, int) and value >= least):
+                raise ValueError(f"trainer.{name}: expected an integer >= {least}, got {value!r}")
+        self.learner, self.collector, self.collocation, self.boundary = learner, collector, collocation, boundary
+        self.updates, self.batch_size = updates, batch_size
+        self.log_every, self.evaluate_every, self.checkpoint_every = log_every, evaluate_every, checkpoint_every
+        self.during, self.final = tuple(during), tuple(final)
+        self.folder = None if folder is None else Path(folder)
+        self.logger = logger if logger is not None and self.folder is not None else NoLogger()
+        self.config = dict(config or {})
+        self.solution = Solution(learner.loss)
+        self.rng = torch.Generator(self.solution.device).manual_seed(seed)
+        # A term whose weight is zero at both ends of the run is left out of the work.
+        ends = [learner.schedule(k) for k in (0, updates)]
+        self.physics = tuple(max(weights) > 0 for weights in zip(*ends, strict=True))[1:]
+        self.update, self.wall_seconds = 0, 0.0
+
+    def train(self) -> dict[str, float]:
+        """Run to the last update; returns the summary.
+
+        Raises:
+            DivergenceError: a loss exploded; the last checkpoint is from before.
+            Interrupted: on SIGINT, after a checkpoint.
+        """
+        if self.folder is not None:
+            self.logger.open(self.folder, self.config)
+            self.logger.rewind(self.update)
+        try:
+            self.collector.start()
+            self._loop()
+        finally:
+            self.collector.close()
+            self.logger.close()
+        return self._finish()
+
+    def _loop(self) -> None:
+        begin = time.perf_counter() - self.wall_seconds
+        with _interruptible() as interrupted, _Progress(self.updates, self.update) as progress:
+            for k in range(self.update, self.updates):
+                self.collector.step(k)
+                terms = self.learner.update(self.sample(), k, k / self.updates)
+                self.update, self.wall_seconds = k + 1, time.perf_counter() - begin
+                row = self._row(k, terms)
+                if row:
+                    self.logger.log(row)
+                progress.show(self.update, row)
+                last = self.update == self.updates
+                if last or interrupted() or (self.checkpoint_every and self.update % self.checkpoint_every == 0):
+                    self.save(keep_weights=not last and not interrupted())
+                if interrupted() and not last:
+                    raise Interrupted(self.update)
+
+    def sample(self) -> TensorDict:
+        """The batch of one update."""
+        parts = {"replay": self.collector.buffer.sample(self.batch_size)}
+        if self.physics[0]:
+            parts["collocation"] = self.collocation.sample(self.rng)
+        if self.physics[1]:
+            parts["boundary"] = self.boundary.sample(self.rng)
+        return TensorDict(parts)
+
+    def _row(self, k: int, terms: Mapping[str, torch.Tensor]) -> dict[str, float]:
+        """The metrics of an update, on those that log; empty on others."""
+        evaluates = bool(self.evaluate_every) and (k == 0 or self.update % self.evaluate_every == 0)
+        if not (k == 0 or evaluates or self.update % self.log_every == 0):
+            return {}
+        row = {"update": self.update, **self.learner.weights_and_rate(k, k / self.updates)}
+        for name in ("td_loss", "hjb_loss", "boundary_loss", "loss_actor"):
+            value = terms[name].item() if name in terms else float("nan")
+            row[name if name.startswith("loss") else f"train_{name}"] = value
+        if evaluates:
+            row |= evaluate(self.solution, self.during)
+        return row
+
+    def _finish(self) -> dict[str, float]:
+        summary = {
+            "updates": self.update,
+            "wall_seconds": self.wall_seconds,
+            "updates_per_second": self.update / self.wall_seconds,
+            **evaluate(self.solution, self.final),
+        }
+        if self.folder is not None:
+            draft = self.folder / ".summary.draft"
+            draft.write_text(json.dumps(summary, indent=2) + "\n")
+            draft.replace(self.folder / "summary.json")
+        return summary
+
+    def save(self, keep_weights: bool = False) -> None:
+        """Write `checkpoints/last.pt`, and the weights alone beside it if they are to be kept."""
+        if self.folder is None:
+            return
+        folder = self.folder / "checkpoints"
+        checkpoint.save(self.state_dict(), folder / checkpoint.LAST)
+        if keep_weights:
+            checkpoint.save(
+                {"loss": self.learner.loss.state_dict(), "update": self.update},
+                checkpoint.weights_path(folder, self.update),
+            )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that an exact continuation needs, as tensors and plain values."""
+        return {
+            "update": self.update,
+            "wall_seconds": self.wall_seconds,
+            "learner": self.learner.state_dict(),
+            "collector": self.collector.state_dict(),
+            "rng": self.rng.get_state(),
+            "torch_rng": torch.get_rng_state(),
+            "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a state; call before `train`."""
+        self.update, self.wall_seconds = state["update"], state["wall_seconds"]
+        self.learner.load_state_dict(state["learner"])
+        self.collector.load_state_dict(state["collector"])
+        self.rng.set_state(state["rng"].cpu())
+        torch.set_rng_state(state["torch_rng"].cpu())
+        if state["cuda_rng"] and torch.cuda.is_available():
+            torch.cuda.set_rng_state_all([entry.cpu() for entry in state["cuda_rng"]])
+
+
+class _Progress:
+    """A bar on a terminal, plain lines at each evaluation elsewhere."""
+
+    def __init__(self, total: int, done: int):
+        self.bar = tqdm(total=total, initial=done, unit="update", disable=None, dynamic_ncols=True)
+        self.total = total
+
+    def show(self, update: int, row: Mapping[str, float]) -> None:
+        self.bar.update(update - self.bar.n if not self.bar.disable else 0)
+        figures = {name: f"{row[name]:.3g}" for name in SHOWN if name in row}
+        if figures and self.bar.disable:
+            text = ", ".join(f"{name} {value}" for name, value in figures.items())
+            print(f"update {update}/{self.total}: {text}", file=sys.stderr, flush=True)
+        elif figures:
+            self.bar.set_postfix(figures)
+
+    def __enter__(self) -> _Progress:
+        return self
+
+    def __exit__(self, *exception) -> None:
+        self.bar.close()
+
+
+@contextmanager
+def _interruptible() -> Iterator[Callable[[], bool]]:
+    """SIGINT raises a flag instead of an exception, so that the loop ends between two updates; a second one kills."""
+    asked = False
+
+    def ask(number, frame):
+        nonlocal asked
+        asked = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    try:
+        previous = signal.signal(signal.SIGINT, ask)
+    except ValueError:  # not in the main thread: nobody sends us signals there
+        yield lambda: False
+        return
+    try:
+        yield lambda: asked
+    finally:
+        signal.signal(signal.SIGINT, previous)

@@ -1,0 +1,121 @@
+"""Slow, obvious versions of what the package computes fast, and the problems the tests run over."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+import pirl_rl.problems
+from pirl_rl.networks import Critic
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.sets import Box
+
+
+class FullNoise(ReachAvoidProblem):
+    """n states, m controls, w channels; drift and a full sigma depend on state and control, nothing is symmetric."""
+
+    horizon = 1.5
+
+    def __init__(self, n: int, m: int, w: int):
+        super().__init__()
+        self.n, self.w = n, w
+        self.states = Box([-1.0 - 0.1 * i for i in range(n)], [2.0 + 0.1 * i for i in range(n)])
+        self.controls = Box([-0.5] * m, [1.5] * m)
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.sin(x.roll(1, -1) + x) + u.sum(-1, keepdim=True) * torch.cos(x)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        row, column = torch.arange(self.n).to(x)[:, None], torch.arange(self.w).to(x)
+        phase = x.unsqueeze(-1) + 0.7 * row + 1.3 * column + 0.4 * u.sum(-1)[..., None, None]
+        return (0.6 + 0.3 * torch.sin(phase)) / self.w**0.5
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return 1.5 - x[..., 0]
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        return x[..., 0] + 0.8
+
+
+class Corner(ReachAvoidProblem):
+    """Planar Brownian motion with drift; the target is a square, an intersection of four half-planes."""
+
+    horizon = 1.0
+    states = Box([-2.0, -2.0], [2.0, 2.0])
+    controls = Box([-1.0, -1.0], [1.0, 1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return u
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.eye(2).to(x).expand(*x.shape[:-1], 2, 2)
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return torch.cat([x - 0.5, -x - 0.5], -1)
+
+
+SHIPPED = [getattr(pirl_rl.problems, name)() for name in pirl_rl.problems.__all__]
+PROBLEMS = [*SHIPPED, FullNoise(1, 1, 2), FullNoise(8, 2, 3)]
+
+
+def name(problem: ReachAvoidProblem) -> str:
+    return f"{type(problem).__name__}-{problem.states.dim}"
+
+
+def nested_generator(
+    value: Callable[[Tensor, Tensor], Tensor], problem: ReachAvoidProblem, tau: Tensor, x: Tensor, u: Tensor
+) -> Tensor:
+    """L^u V (N,) of V: (N,), (N, n) -> (N,), by nested autograd and the full Hessian."""
+    tau, x = tau.detach().requires_grad_(), x.detach().requires_grad_()
+    along_tau, along_x = torch.autograd.grad(value(tau, x).sum(), (tau, x), create_graph=True)
+    rows = [torch.autograd.grad(column.sum(), x, create_graph=True)[0] for column in along_x.unbind(-1)]
+    f, sigma = problem.drift(x, u).detach(), problem.diffusion(x, u).detach()
+    trace = (sigma @ sigma.mT * torch.stack(rows, -2)).sum((-2, -1))
+    return -along_tau + (f * along_x).sum(-1) + trace / 2
+
+
+def stack(critics: Sequence[Critic]) -> Critic:
+    """One critic whose parameters carry a leading axis over `critics`, as TorchRL's losses hold them."""
+    twin = copy.deepcopy(critics[0])
+    for layer, *layers in zip(twin.layers, *(critic.layers for critic in critics), strict=True):
+        for key in layer._parameters:
+            setattr(layer, key, nn.Parameter(torch.stack([getattr(one, key) for one in layers]).detach()))
+        for key in layer._buffers:
+            setattr(layer, key, torch.stack([getattr(one, key) for one in layers]))
+    return twin
+
+
+def points(problem: ReachAvoidProblem, count: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """tau, x, normalised action and physical control, in the default dtype."""
+    generator = torch.Generator().manual_seed(seed)
+    dtype = torch.get_default_dtype()
+    tau = problem.horizon * torch.rand(count, generator=generator, dtype=dtype)
+    x = problem.states.sample(count, generator, dtype)
+    action = 2 * torch.rand(count, problem.controls.dim, generator=generator, dtype=dtype) - 1
+    return tau, x, action, problem.controls.denormalize(action)
+
+
+def make_batch(problem: ReachAvoidProblem, count: int = 24) -> TensorDict:
+    """A batch for `PIRLLoss` of random transitions, collocation points (some masked) and boundary points."""
+    generator = torch.Generator().manual_seed(7)
+    here, there, inside, edge = (points(problem, count, seed) for seed in range(4))
+    replay = {
+        "tau": here[0].unsqueeze(-1),
+        "state": here[1],
+        "action": here[2],
+        "next": {
+            "tau": there[0].unsqueeze(-1),
+            "state": there[1],
+            "reward": torch.rand(count, 1, generator=generator),
+            "terminated": torch.rand(count, 1, generator=generator) < 0.3,
+            "done": torch.ones(count, 1, dtype=torch.bool),
+        },
+    }
+    collocation = {"tau": inside[0].unsqueeze(-1), "state": inside[1], "mask": torch.arange(count) % 3 > 0}
+    boundary = {"tau": edge[0].unsqueeze(-1), "state": edge[1], "value": torch.rand(count, generator=generator)}
+    parts = {"replay": replay, "collocation": collocation, "boundary": boundary}
+    return TensorDict({key: TensorDict(part, batch_size=[count]) for key, part in parts.items()})

@@ -1,0 +1,209 @@
+"""Evaluators on solutions whose metrics are known: the exact value, a reversed policy, and networks to repeat."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from pirl_rl.evaluation import METRICS, Calibration, ExactError, Residuals, Success, evaluate
+from pirl_rl.initial_states import UniformStates
+from pirl_rl.losses import PIRLLoss
+from pirl_rl.networks import Actor, Critic
+from pirl_rl.operators import generator
+from pirl_rl.payoffs import LipschitzPayoff
+from pirl_rl.problems import Reach1D, Safety1D
+from pirl_rl.solution import Solution
+
+EVALUATORS = [ExactError(), Calibration(32, 32), Success(500), Residuals(256)]
+
+
+def normal_cdf(z: Tensor) -> Tensor:
+    return torch.special.erfc(-z / math.sqrt(2)) / 2
+
+
+def first_passage(tau: Tensor, x: Tensor, u: float) -> Tensor:
+    """P(reach 2 within tau) under the constant control u, the reflection formula, with the boundary's own values."""
+    d = 2 - x[..., 0]
+    inside = (d > 0) & (tau > 0)
+    d, t = torch.where(inside, d, 1.0), torch.where(inside, tau, 1.0)
+    value = normal_cdf((u * t - d) / t.sqrt()) + torch.exp(2 * u * d) * normal_cdf((-u * t - d) / t.sqrt())
+    return torch.where(inside, value, (2 - x[..., 0] <= 0).to(value))
+
+
+class Known:
+    """Stands for a `Solution`: the control is `u` everywhere and V is the value of `u`, plus an error if wanted."""
+
+    dtype, device = torch.float64, torch.device("cpu")
+
+    def __init__(self, u: float = 1.0, offset: float = 0.0):
+        self.problem, self.u, self.offset = Reach1D(), u, offset
+
+    def policy(self, tau, x):
+        return torch.full_like(x, self.u)
+
+    def raw_value(self, tau, x):
+        return first_passage(tau, x, self.u) + self.offset
+
+    def value(self, tau, x):
+        return torch.where(self.problem.reached(x), torch.ones_like(tau), self.raw_value(tau, x))
+
+    def residual(self, tau, x, u=None):
+        return generator(self.raw_value, self.problem, tau, x, self.policy(tau, x) if u is None else u)
+
+
+@pytest.fixture(params=[Reach1D, Safety1D])
+def network(request):
+    torch.manual_seed(0)
+    problem = request.param()
+    return Solution(PIRLLoss(problem, Actor(problem), [Critic(problem), Critic(problem)]))
+
+
+def test_exact_error_of_the_exact_value_is_zero():
+    metrics = ExactError()(Known())
+    assert max(metrics.values()) < 1e-10
+    assert set(metrics) == {"value_mse", "value_max_error", "masked_value_mse"}
+
+
+def test_exact_error_of_a_known_offset():
+    """An offset of 0.1 is in every raw value; the mask takes it off on the 1 of 201 columns that lies in the target."""
+    metrics = ExactError()(Known(offset=0.1))
+    assert metrics["value_mse"] == pytest.approx(0.01)
+    assert metrics["value_max_error"] == pytest.approx(0.1)
+    assert metrics["masked_value_mse"] == pytest.approx(0.01 * 200 / 201)
+
+
+def test_exact_error_needs_an_exact_value(network):
+    known = network.problem.exact_value(torch.ones(1), torch.zeros(1, 1)) is not None
+    assert bool(ExactError(11, 11)(network)) == known
+
+
+def test_exact_error_in_two_dimensions_samples_the_box():
+    class Plane(Reach1D):
+        states = type(Reach1D.states)([-2.0, 0.0], [2.0, 1.0])
+
+    known = Known(offset=0.1)
+    known.problem = Plane()
+    assert ExactError(20, 20)(known)["value_mse"] == pytest.approx(0.01)
+
+
+def test_residuals_of_the_exact_value_vanish():
+    metrics = Residuals(1024)(Known())
+    assert metrics["hjb_loss"] < 1e-16
+    assert metrics["hjb_sup_loss"] < 1e-16
+    assert metrics["boundary_loss"] < 1e-8
+
+
+def test_sup_residual_exposes_a_reversed_policy():
+    """The value of u = -1 solves its own linear equation and the boundary; max_u L^u V = 2 V_x betrays it."""
+    reversed_policy = Known(u=-1.0)
+    metrics = Residuals(1024)(reversed_policy)
+    assert metrics["hjb_loss"] < 1e-16
+    assert metrics["boundary_loss"] < 1e-8
+    uniform = torch.Generator().manual_seed(5)
+    tau, x = (
+        2 * torch.rand(200_000, generator=uniform).double(),
+        4 * torch.rand(200_000, 1, generator=uniform).double() - 2,
+    )
+    slope = torch.func.jvp(lambda x: reversed_policy.raw_value(tau, x), (x,), (torch.ones_like(x),))[1]
+    assert metrics["hjb_sup_loss"] == pytest.approx((2 * slope).square().mean().item(), rel=0.2)
+
+
+def test_boundary_loss_of_a_known_offset():
+    assert Residuals(512)(Known(offset=0.1))["boundary_loss"] == pytest.approx(0.01, rel=1e-3)
+
+
+def one_step_variance(dt: float, points: int = 200, nodes: int = 161) -> float:
+    """E (V(y) - V(y'))^2 for the exact value and u = 1, by quadrature over y, the end point and the crossing."""
+    steps = torch.arange(1, round(2 / dt) + 1, dtype=torch.float64)[:, None, None]
+    x = (4 * (torch.arange(points, dtype=torch.float64) + 0.5) / points - 2)[:, None, None]
+    z = torch.linspace(-6, 6, nodes, dtype=torch.float64)
+    weight = torch.exp(-z * z / 2) / torch.exp(-z * z / 2).sum()
+    end = x[..., 0] + dt + math.sqrt(dt) * z
+    hit = torch.exp(-2 * (2 - x[..., 0]) * (2 - end).clamp(min=0) / dt)
+    value = first_passage(steps * dt, x[None], 1.0)
+    later = first_passage((steps - 1) * dt, end[None, ..., None], 1.0)
+    return ((hit * (1 - value) ** 2 + (1 - hit) * (later - value) ** 2) * weight).sum(-1).mean().item()
+
+
+@pytest.mark.parametrize("dt", [0.1, 0.02])
+def test_td_loss_of_the_exact_value_is_the_variance_of_a_step(dt):
+    """16,384 transitions estimate it with a deviation of 2% (dt = 0.1) and 4% (dt = 0.02)."""
+    assert Residuals(16_384, dt=dt)(Known())["td_loss"] == pytest.approx(one_step_variance(dt), rel=0.12)
+
+
+def test_td_loss_sees_a_wrong_value():
+    """An offset c of V stays in the error of the steps that end an episode, and only there."""
+    exact, wrong = (Residuals(16_384)(Known(offset=offset))["td_loss"] for offset in (0.0, 0.3))
+    assert exact + 0.3**2 * 0.05 < wrong < exact + 0.3**2 * 0.5
+
+
+def test_calibration_of_the_exact_value_is_its_noise():
+    metrics = Calibration(256, 256)(Known())
+    assert metrics["calibration_mse"] == pytest.approx(metrics["calibration_noise"], rel=0.4)
+    worse = Calibration(256, 256)(Known(offset=0.1))
+    assert worse["calibration_mse"] == pytest.approx(0.01 + metrics["calibration_noise"], rel=0.2)
+    assert worse["calibration_mae"] == pytest.approx(0.1, rel=0.1)
+
+
+def test_success_rate_of_constant_controls():
+    """From x = 0 with the whole horizon to go: the exact hit probabilities, within 4 standard errors of 20,000."""
+    start = UniformStates([-1e-6], [1e-6], tau="fixed")
+    evaluator = Success(20_000, initial_states=start)
+    for u in (1.0, -1.0):
+        exact = first_passage(torch.tensor([2.0]), torch.zeros(1, 1), u).item()
+        metrics = evaluator(Known(u))
+        assert metrics["success_rate"] == pytest.approx(exact, abs=4 * math.sqrt(exact * (1 - exact) / 20_000))
+        assert metrics["success_low"] < metrics["success_rate"] < metrics["success_high"]
+        assert metrics["reward"] == metrics["success_rate"]
+        assert metrics["optimal_reward"] == pytest.approx(0.6277, abs=0.014)
+
+
+def test_success_watched_at_end_points_only():
+    """Twenty steps of 0.1 s watched at their ends hit with probability 0.5772, a known number."""
+    start = UniformStates([-1e-6], [1e-6], tau="fixed")
+    metrics = Success(20_000, crossing="endpoint", initial_states=start)(Known())
+    assert metrics["success_rate"] == pytest.approx(0.5772, abs=0.014)
+
+
+def test_success_of_a_smoothed_payoff_counts_the_hard_target():
+    smooth = Known()
+    smooth.problem = Reach1D(LipschitzPayoff(0.5))
+    hard, soft = (
+        Success(5_000, initial_states=UniformStates([-2.0], [1.8]))(Known()),
+        Success(5_000, initial_states=UniformStates([-2.0], [1.8]))(smooth),
+    )
+    assert soft["success_rate"] == hard["success_rate"]
+    assert soft["reward"] < hard["reward"]
+
+
+def test_evaluation_repeats_and_leaves_torch_alone(network):
+    before = torch.get_rng_state()
+    first, again = evaluate(network, EVALUATORS), evaluate(network, EVALUATORS)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert first == again
+    assert all(type(value) is float and math.isfinite(value) for value in first.values())
+    assert set(first) <= set(METRICS)
+
+
+def test_every_metric_is_documented_and_made():
+    torch.manual_seed(0)
+    problem = Reach1D()
+    solution = Solution(PIRLLoss(problem, Actor(problem), [Critic(problem), Critic(problem)]))
+    assert set(evaluate(solution, EVALUATORS)) == set(METRICS)
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments"),
+    [
+        (ExactError, {"tau_points": 1}),
+        (Calibration, {"rollouts": 1}),
+        (Success, {"episodes": 0}),
+        (Residuals, {"points": 0}),
+    ],
+)
+def test_wrong_sizes_are_refused(kind, arguments):
+    with pytest.raises(ValueError, match=f"{kind.__name__}.*{next(iter(arguments))}"):
+        kind(**arguments)

@@ -1,0 +1,307 @@
+"""PIRLLoss against TorchRL's own TD3Loss, bit for bit, and against the paper's formulas written by hand."""
+
+from __future__ import annotations
+
+import copy
+import shutil
+
+import pytest
+import torch
+from oracles import PROBLEMS, FullNoise, make_batch, name, nested_generator
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.objectives import TD3Loss
+
+from pirl_rl.losses import WEIGHTS, PIRLLoss
+from pirl_rl.networks import Actor, Critic
+from pirl_rl.problems import Reach1D
+
+RELATIVE = 1e-10
+some_problems = pytest.mark.parametrize("problem", [Reach1D(), FullNoise(8, 2, 3)], ids=name)
+
+
+@pytest.fixture
+def float64():
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+def networks(problem, critics: int = 2):
+    torch.manual_seed(3)
+    nets = [Actor(problem, (8, 8), "Tanh"), *(Critic(problem, (9, 7)) for _ in range(critics))]
+    for parameter in nn.ModuleList(nets).parameters():
+        nn.init.normal_(parameter, std=0.5)
+    return nets[0], nets[1:]
+
+
+def target_networks(problem, critics: int = 2):
+    """Other weights than the online ones, so that a confusion of the two shows."""
+    actor, nets = networks(problem, critics)
+    for parameter in nn.ModuleList([actor, *nets]).parameters():
+        parameter.data.mul_(0.9).add_(0.05)
+    return actor, nets
+
+
+def make_loss(problem, critics: int = 2, weights=(1.0, 1.0, 1.0), **kwargs) -> PIRLLoss:
+    loss = PIRLLoss(problem, *networks(problem, critics), **kwargs, **dict(zip(WEIGHTS, weights, strict=True)))
+    for params in (loss.target_actor_network_params, loss.target_qvalue_network_params):
+        params.data.apply_(lambda entry: entry.mul_(0.9).add_(0.05) if entry.requires_grad is False else entry)
+    for target, online in _buffers(loss):
+        target.copy_(online)
+    return loss
+
+
+def _buffers(loss):
+    """Scalings are buffers, not weights: targets share them."""
+    for target, online in (
+        (loss.target_actor_network_params, loss.actor_network_params),
+        (loss.target_qvalue_network_params, loss.qvalue_network_params),
+    ):
+        for key, entry in online.items(True, True):
+            if not isinstance(entry, nn.Parameter):
+                yield target[key].data, entry.data
+
+
+def td3_twin(loss: PIRLLoss) -> TD3Loss:
+    """TorchRL's loss with the same parameters and targets, built from other networks."""
+    actor, critics = networks(loss.problem, loss.num_qvalue_nets)
+    for parameter in nn.ModuleList([actor, *critics]).parameters():
+        nn.init.zeros_(parameter)
+    one = torch.ones(loss.problem.controls.dim)
+    td3 = TD3Loss(
+        TensorDictModule(actor, ["tau", "state"], ["action"]),
+        [TensorDictModule(critic, ["tau", "state", "action"], ["state_action_value"]) for critic in critics],
+        bounds=(-one, one),
+        num_qvalue_nets=len(critics),
+        policy_noise=loss.policy_noise,
+        noise_clip=loss.noise_clip,
+        loss_function="l2",
+    )
+    td3.make_value_estimator(gamma=1.0)
+    for key in ("actor_network_params", "qvalue_network_params"):
+        for prefix in ("", "target_"):
+            getattr(td3, prefix + key).data.copy_(getattr(loss, prefix + key).data)
+    return td3
+
+
+def gradients(value, params):
+    return torch.autograd.grad(value, list(params.parameters()), allow_unused=True, materialize_grads=True)
+
+
+def assert_close(ours, theirs):
+    for mine, other in zip(ours, theirs, strict=True):
+        assert (mine - other).norm() <= RELATIVE * other.norm()
+    assert any(other.norm() > 0 for other in theirs)
+
+
+# Weights (1, 0, 0)
+
+
+@some_problems
+@pytest.mark.parametrize("critics", [1, 2])
+def test_td_alone_is_td3loss_bit_for_bit(problem, critics):
+    loss, batch = make_loss(problem, critics, weights=(1.0, 0.0, 0.0)), make_batch(problem)
+    td3 = td3_twin(loss)
+    torch.manual_seed(11)
+    ours, parts = loss.critic_loss(batch)
+    torch.manual_seed(11)
+    theirs, _ = td3.value_loss(batch["replay"])
+    assert torch.equal(ours, theirs)
+    assert torch.equal(parts["td_loss"], theirs)
+    for mine, other in zip(
+        gradients(ours, loss.qvalue_network_params), gradients(theirs, td3.qvalue_network_params), strict=True
+    ):
+        assert other.norm() > 0
+        assert torch.equal(mine, other)
+
+
+@some_problems
+def test_actor_by_q_is_td3loss_bit_for_bit(problem):
+    loss, batch = make_loss(problem, actor_rule="q"), make_batch(problem)
+    td3 = td3_twin(loss)
+    ours, theirs = loss.actor_loss(batch)[0], td3.actor_loss(batch["replay"])[0]
+    assert torch.equal(ours, theirs)
+    for mine, other in zip(
+        gradients(ours, loss.actor_network_params), gradients(theirs, td3.actor_network_params), strict=True
+    ):
+        assert other.norm() > 0
+        assert torch.equal(mine, other)
+
+
+@some_problems
+def test_forward_returns_both_losses_and_their_parts(problem):
+    loss, batch = make_loss(problem, weights=(0.5, 0.25, 2.0)), make_batch(problem)
+    torch.manual_seed(11)
+    out = loss(batch)
+    assert set(out.keys()) == {"loss_actor", "loss_qvalue", "td_loss", "hjb_loss", "boundary_loss"}
+    expected = 0.5 * out["td_loss"] + 0.25 * out["hjb_loss"] + 2 * out["boundary_loss"]
+    torch.testing.assert_close(out["loss_qvalue"], expected)
+    assert torch.equal(out["loss_actor"], loss.actor_loss(batch)[0])
+
+
+@pytest.mark.usefixtures("float64")
+@some_problems
+def test_one_critic_without_smoothing_is_ddpg(problem):
+    loss, replay = make_loss(problem, 1, (1.0, 0.0, 0.0), policy_noise=0.0), make_batch(problem)["replay"]
+    actor, (critic,) = target_networks(problem, 1)
+    following = replay["next"]
+    value = critic(following["tau"], following["state"], actor(following["tau"], following["state"]))
+    target = following["reward"] + torch.where(following["terminated"], 0.0, value)
+    _, (critic,) = networks(problem, 1)
+    by_hand = (critic(replay["tau"], replay["state"], replay["action"]) - target.detach()).square().mean()
+    ours, _ = loss.critic_loss(make_batch(problem).select("replay"))
+    assert_close([ours], [by_hand])
+    assert_close(gradients(ours, loss.qvalue_network_params), [grad[None] for grad in gradients(by_hand, critic)])
+
+
+# Weights (0, 1, 0) and (0, 0, 1)
+
+
+@pytest.mark.usefixtures("float64")
+@pytest.mark.parametrize("problem", PROBLEMS, ids=name)
+def test_hjb_alone_by_hand(problem):
+    loss, batch = make_loss(problem, weights=(0.0, 1.0, 0.0)), make_batch(problem)
+    inside, (actor, _) = batch["collocation"], target_networks(problem)
+    kept = inside[inside["mask"]]
+    action = actor(kept["tau"], kept["state"]).detach()
+    _, critics = networks(problem)
+    by_hand = torch.zeros(())
+    for critic in critics:
+        residual = nested_generator(
+            lambda tau, x, critic=critic: critic(tau[:, None], x, action)[:, 0],
+            problem,
+            kept["tau"][:, 0],
+            kept["state"],
+            problem.controls.denormalize(action),
+        )
+        by_hand = by_hand + residual.square().mean()
+    ours, _ = loss.critic_loss(batch)
+    assert_close([ours], [by_hand])
+    assert_same_gradients(ours, loss, by_hand, critics)
+
+
+@pytest.mark.usefixtures("float64")
+@pytest.mark.parametrize("problem", PROBLEMS, ids=name)
+def test_boundary_alone_by_hand(problem):
+    loss, batch = make_loss(problem, weights=(0.0, 0.0, 1.0)), make_batch(problem)
+    edge, (actor, _) = batch["boundary"], target_networks(problem)
+    action = actor(edge["tau"], edge["state"]).detach()
+    _, critics = networks(problem)
+    by_hand = sum(
+        (critic(edge["tau"], edge["state"], action)[:, 0] - edge["value"]).square().mean() for critic in critics
+    )
+    ours, _ = loss.critic_loss(batch)
+    assert_close([ours], [by_hand])
+    assert_same_gradients(ours, loss, by_hand, critics)
+
+
+def assert_same_gradients(ours, loss, by_hand, critics):
+    theirs = [gradients(by_hand, critic) for critic in critics]
+    stacked = [torch.stack(pair) for pair in zip(*theirs, strict=True)]
+    assert_close(gradients(ours, loss.qvalue_network_params), stacked)
+
+
+@pytest.mark.usefixtures("float64")
+def test_masked_points_do_not_count():
+    problem = FullNoise(3, 1, 2)
+    loss, batch = make_loss(problem, weights=(0.0, 1.0, 0.0), actor_rule="hamiltonian"), make_batch(problem)
+    other = copy.deepcopy(batch)
+    other["collocation", "state"][~batch["collocation", "mask"]] += 0.5
+    assert not torch.equal(other["collocation", "state"], batch["collocation", "state"])
+    for term in (loss.critic_loss, loss.actor_loss):
+        assert_close([term(other)[0]], [term(batch)[0]])
+    batch["collocation", "mask"].zero_()
+    ours, _ = loss.critic_loss(batch)
+    assert ours == 0
+    assert all((grad == 0).all() for grad in gradients(ours, loss.qvalue_network_params))
+
+
+@pytest.mark.usefixtures("float64")
+def test_noise_on_the_action_of_the_residual():
+    """The noise moves the critic's action and the control of the drift alike, and is clipped."""
+    problem = FullNoise(3, 1, 2)
+    batch = make_batch(problem)
+    quiet, loud = (make_loss(problem, weights=(0.0, 1.0, 0.0), hjb_noise=noise) for noise in (0.0, 0.3))
+    silenced = make_loss(problem, weights=(0.0, 1.0, 0.0), hjb_noise=0.3, hjb_noise_clip=0.0)
+    assert not torch.isclose(quiet.critic_loss(batch)[0], loud.critic_loss(batch)[0], rtol=1e-3)
+    assert torch.equal(quiet.critic_loss(batch)[0], silenced.critic_loss(batch)[0])
+
+
+# The actor's rules
+
+
+@pytest.mark.usefixtures("float64")
+@pytest.mark.parametrize("problem", PROBLEMS, ids=name)
+def test_hamiltonian_by_hand(problem):
+    loss, batch = make_loss(problem, actor_rule="hamiltonian"), make_batch(problem)
+    kept = batch["collocation"][batch["collocation"]["mask"]]
+    actor, critics = networks(problem)
+    action = actor(kept["tau"], kept["state"])
+    x, frozen = kept["state"].clone().requires_grad_(), action.detach()
+    value = sum(critic(kept["tau"], x, frozen)[:, 0] for critic in critics) / len(critics)
+    (slope,) = torch.autograd.grad(value.sum(), x, create_graph=True)
+    hessian = torch.stack([torch.autograd.grad(entry.sum(), x, retain_graph=True)[0] for entry in slope.unbind(-1)], -1)
+    u = problem.controls.denormalize(action)
+    sigma = problem.diffusion(kept["state"], u)
+    trace = (sigma @ sigma.mT * hessian.detach()).sum((-2, -1))
+    by_hand = -((problem.drift(kept["state"], u) * slope.detach()).sum(-1) + trace / 2).mean()
+    ours, _ = loss.actor_loss(batch)
+    assert_close(gradients(ours, loss.actor_network_params), gradients(by_hand, actor))
+    assert all((grad == 0).all() for grad in gradients(loss.actor_loss(batch)[0], loss.qvalue_network_params))
+
+
+@pytest.mark.usefixtures("float64")
+def test_both_is_the_sum_of_the_rules():
+    problem = FullNoise(3, 2, 2)
+    batch = make_batch(problem)
+    q, hamiltonian, both = (
+        gradients(loss.actor_loss(batch)[0], loss.actor_network_params)
+        for loss in (make_loss(problem, actor_rule=rule) for rule in ("q", "hamiltonian", "both"))
+    )
+    assert_close(both, [a + b for a, b in zip(q, hamiltonian, strict=True)])
+
+
+def test_an_unknown_rule_is_named():
+    with pytest.raises(ValueError, match=r"actor_rule: expected 'q', 'hamiltonian' or 'both', got 'ppo'"):
+        make_loss(Reach1D(), actor_rule="ppo")
+
+
+def test_a_relu_critic_is_refused_by_name():
+    problem = Reach1D()
+    with pytest.raises(TypeError, match="got ReLU"):
+        PIRLLoss(problem, Actor(problem), [Critic(problem, (4,), "ReLU")])
+
+
+# Weights
+
+
+def test_weights_move_in_place_and_are_saved():
+    problem = Reach1D()
+    loss, batch = make_loss(problem, weights=(0.0, 1.0, 0.0)), make_batch(problem)
+    buffer, before = loss.hjb_weight, loss.critic_loss(batch)[0]
+    loss.hjb_weight = 0.25
+    assert loss.hjb_weight is buffer
+    torch.testing.assert_close(loss.critic_loss(batch)[0], before / 4)
+    other = make_loss(problem, weights=(1.0, 0.0, 0.0))
+    other.load_state_dict(loss.state_dict())
+    assert [getattr(other, key).item() for key in WEIGHTS] == [0.0, 0.25, 0.0]
+
+
+@pytest.mark.skipif(not (shutil.which("g++") or shutil.which("clang++")), reason="torch.compile needs a C++ compiler")
+@pytest.mark.usefixtures("float64")
+def test_compiled_equals_eager_and_follows_the_weights():
+    """Without smoothing noise, whose stream differs under the compiler."""
+    problem = FullNoise(3, 1, 2)
+    loss, batch = make_loss(problem, policy_noise=0.0), make_batch(problem)
+    compiled = torch.compile(loss.critic_loss, fullgraph=True)
+    for weights in ((1.0, 1.0, 1.0), (0.1, 0.7, 2.0)):
+        for key, weight in zip(WEIGHTS, weights, strict=True):
+            setattr(loss, key, weight)
+        eager = loss.critic_loss(batch)[0]
+        ours = compiled(batch)[0]
+        torch.testing.assert_close(ours, eager, rtol=1e-6, atol=0)
+        for mine, other in zip(
+            gradients(ours, loss.qvalue_network_params), gradients(eager, loss.qvalue_network_params), strict=True
+        ):
+            assert (mine - other).norm() <= 1e-6 * other.norm()
