@@ -1,12 +1,12 @@
 """Time of whole learner updates on one thread: the Ito fast path, compiled and eager, against nested autograd.
 
-    python benchmarks/learner.py [--rounds 15] [--updates 20]
+    python benchmarks/learner.py [--rounds 60] [--updates 4]
 
-An update is TD, HJB and boundary terms, backward, fused Adam, and every second time the actor with its Adam and the soft
-update of the targets. All contenders share networks, points, optimisers and this loop. "nested" differentiates the same
-critics by one gradient with create_graph and one Hessian-vector product per noise channel, both critics at once; it
-cannot be compiled, so its other terms run eagerly, or compiled in "nested, rest compiled". "HJB term" is that loss alone, forward and
-backward. The contenders take turns within every round; figures are medians over the rounds.
+An update is TD, HJB and boundary terms, backward, fused Adam, and every second time the actor with its Adam and the
+soft update of the targets. All contenders share networks, points, optimisers and this loop. "nested" differentiates
+the same critics by one gradient with create_graph and one Hessian-vector product per noise channel, both critics at
+once; it cannot be compiled, so its other terms run eagerly, or compiled in "nested, rest compiled". "HJB term" is that
+loss alone, forward and backward. Contenders take turns, a few updates each; figures are medians over all turns.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class Learner:
         self.loss = kind(
             shape.problem,
             Actor(shape.problem, (32, 32)),
-            [Critic(shape.problem, shape.critic) for _ in range(2)],
+            [Critic(shape.problem, shape.critic, root_time=False) for _ in range(2)],
             actor_rule="q",
             hjb_weight=1.0,
             boundary_weight=1.0,
@@ -179,8 +179,8 @@ def measure(shape: Shape, rounds: int, updates: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--updates", type=int, default=20)
+    parser.add_argument("--rounds", type=int, default=60)
+    parser.add_argument("--updates", type=int, default=4)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     print(f"torch {torch.__version__}, 1 thread, medians of {arguments.rounds} x {arguments.updates} updates\n")

@@ -1,18 +1,19 @@
 """Checkpoints: `last.pt` holds everything a run needs to go on, `weights-<update>.pt` the loss module alone.
 
-Files are written beside their place, flushed and moved into it in one step, so that a killed run never leaves a broken
-one; they hold tensors and plain values only and are read with `weights_only=True`, so that a foreign file runs no code.
+A killed run never leaves a broken one. They hold tensors and plain values only and are read with `weights_only=True`,
+so that a foreign file runs no code.
 """
 
 from __future__ import annotations
 
-import os
-import pickle
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from pirl_rl.files import replacing
+
+FOLDER = "checkpoints"
 LAST = "last.pt"
 
 
@@ -22,17 +23,12 @@ class CheckpointError(RuntimeError):
 
 def save(state: dict[str, Any], path: Path) -> None:
     """Write a state atomically."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.draft")
-    with draft.open("wb") as file:
+    with replacing(path, binary=True) as file:
         torch.save(state, file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(draft, path)
 
 
-def load(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
-    """Read a state.
+def load(path: Path) -> dict[str, Any]:
+    """Read a state, to the CPU: its users move it where they are.
 
     Raises:
         CheckpointError: with the file and the reason.
@@ -40,11 +36,11 @@ def load(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
     if not path.is_file():
         raise CheckpointError(f"no checkpoint at {path}")
     try:
-        state = torch.load(path, map_location=device, weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # a foreign file may be wrong in any way
+        reason = str(error).partition("\n")[0].partition(". ")[0] or type(error).__name__
         raise CheckpointError(f"{path} is not a checkpoint of tensors and plain values: {reason}") from None
-    if not isinstance(state, dict) or "loss" not in state.get("learner", state):
+    if not isinstance(state, dict) or not isinstance(loss := state.get("learner", state), dict) or "loss" not in loss:
         raise CheckpointError(f"{path} is not a checkpoint of pirl_rl: it holds no loss module")
     return state
 

@@ -80,6 +80,7 @@ class BoundarySampler:
         initial: points a draw at tau = 0, uniform in `states` outside A and B.
         faces: points a draw on the faces.
         widen: the box of the points at tau = 0 is wider than `states` by this factor.
+        tau_power: tau = T U^tau_power on the faces, as in `Collocation`.
         seed: of the pool.
 
     Raises:
@@ -87,11 +88,19 @@ class BoundarySampler:
     """
 
     def __init__(
-        self, problem: ReachAvoidProblem, initial: int = 100, faces: int = 100, widen: float = 1.0, seed: int = 0
+        self,
+        problem: ReachAvoidProblem,
+        initial: int = 100,
+        faces: int = 100,
+        widen: float = 1.0,
+        tau_power: float = 1.0,
+        seed: int = 0,
     ):
         if initial < 0 or faces < 0 or initial + faces < 1:
             raise ValueError(f"boundary: expected initial, faces >= 0 and one of them > 0, got {initial} and {faces}")
-        self.problem, self.initial, self.faces = problem, initial, faces
+        if not widen > 0 or not tau_power > 0:
+            raise ValueError(f"boundary: expected widen > 0 and tau_power > 0, got {widen} and {tau_power}")
+        self.problem, self.initial, self.faces, self.tau_power = problem, initial, faces, tau_power
         self.box = problem.states.expand(widen)
         generator = torch.Generator().manual_seed(seed)
         self._pool = _face_pool(problem, generator)
@@ -105,7 +114,7 @@ class BoundarySampler:
             points, values = (entry.to(device) for entry in self._pool)
             index = torch.randint(len(points), (self.faces,), generator=generator, device=device)
             late = 1 - torch.rand(self.faces, 1, generator=generator, device=device)
-            tau = torch.cat([tau, self.problem.horizon * late])
+            tau = torch.cat([tau, self.problem.horizon * late**self.tau_power])
             state, value = torch.cat([state, points[index]]), torch.cat([value, values[index]])
         return TensorDict({"tau": tau, "state": state, "value": value}, batch_size=[len(tau)])
 

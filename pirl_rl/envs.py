@@ -1,8 +1,9 @@
 """Reach-avoid problems as TorchRL environments: the additive-reward problem of the paper's Proposition 1.
 
 A batch of paths in one TensorDict: "tau" (*, 1), the time to go, is part of the state; "state" (*, n) in SI units;
-"action" (*, m) is the control in [-1, 1] coordinates. A and B absorb, so every end, the horizon's too, is a `terminated`.
-The reward is l_eps of the last state: 1 on success, else 0 with the hard payoff.
+"action" (*, m) is the control in [-1, 1] coordinates; "is_init" (*, 1) marks an episode's first state. A and B absorb,
+so every end, the horizon's too, is a `terminated`. The reward is l_eps of the last state: 1 on success, else 0 with the
+hard payoff.
 """
 
 from __future__ import annotations
@@ -74,6 +75,7 @@ class ReachAvoidEnv(EnvBase):
         self.observation_spec = Composite(
             tau=Bounded(0.0, problem.horizon, (*bs, 1), device=device),
             state=Unbounded((*bs, problem.states.dim), device=device),
+            is_init=Categorical(2, (*bs, 1), dtype=torch.bool, device=device),
             shape=bs,
             device=device,
         )
@@ -91,6 +93,7 @@ class ReachAvoidEnv(EnvBase):
             {
                 "tau": (steps * self.simulator.dt).to(state.dtype).unsqueeze(-1),
                 "state": state,
+                "is_init": ~none,
                 "done": none,
                 "terminated": none.clone(),
             },
@@ -109,6 +112,7 @@ class ReachAvoidEnv(EnvBase):
             {
                 "tau": (steps * dt).clamp(min=0),
                 "state": step.state,
+                "is_init": torch.zeros_like(terminated),
                 "reward": exit_value(self.problem, step).unsqueeze(-1) * terminated,
                 "done": terminated,
                 "terminated": terminated.clone(),

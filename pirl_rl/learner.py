@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import shutil
 import warnings
 from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch._dynamo.exc import BackendCompilerFailed
 from torchrl.objectives import SoftUpdate
 
 from pirl_rl.losses import PIRLLoss
@@ -33,7 +33,7 @@ class Learner:
         decay: "cosine" lets the rate fall to zero along a quarter wave, "constant" keeps it.
         actor_every: critic updates for each update of the actor and the targets (d_up).
         polyak: rate of the targets.
-        compile: compile both losses; without a C++ compiler on the CPU they run eagerly after one warning.
+        compile: compile both losses; where that fails, as without a C++ compiler, they run eagerly after one warning.
     """
 
     def __init__(
@@ -58,13 +58,14 @@ class Learner:
         self.targets = SoftUpdate(loss, tau=polyak)
         self.critic_optimizer = _adam(loss.qvalue_network_params, learning_rate)
         self.actor_optimizer = _adam(loss.actor_network_params, learning_rate)
-        device = next(loss.parameters()).device
-        compile = compile and _can_compile(device)
-        self.critic_loss = torch.compile(loss.critic_loss) if compile else loss.critic_loss
-        self.actor_loss = torch.compile(loss.actor_loss) if compile else loss.actor_loss
+        self.compile = compile
+        self._compiled = {name: torch.compile(getattr(loss, name)) for name in ("critic_loss", "actor_loss")}
+        self._loss_actor = torch.tensor(math.nan)
 
     def update(self, batch: TensorDictBase, k: int, progress: float) -> dict[str, Tensor]:
         """The k-th update (from 0) on {"replay", "collocation", "boundary"}; returns the unweighted terms.
+
+        "loss_actor" is that of the actor's last update.
 
         Args:
             progress: k as a fraction of the run, for the learning rate.
@@ -73,16 +74,26 @@ class Learner:
             DivergenceError: before the step that would have spoilt the networks.
         """
         self._set_weights_and_rate(k, progress)
-        loss, terms = self.critic_loss(batch)
-        self._check(loss, terms, k)
+        loss, terms = self._evaluate("critic_loss", batch)
+        self._check(loss, terms, k + 1)
         self._step(self.critic_optimizer, loss)
         if k % self.actor_every == 0:
-            loss_actor, _ = self.actor_loss(batch)
-            self._check(loss_actor, {"loss_actor": loss_actor}, k)
+            loss_actor, _ = self._evaluate("actor_loss", batch)
+            self._check(loss_actor, {"loss_actor": loss_actor}, k + 1)
             self._step(self.actor_optimizer, loss_actor)
             self.targets.step()
-            terms = {**terms, "loss_actor": loss_actor.detach()}
-        return terms
+            self._loss_actor = loss_actor.detach()
+        return {**terms, "loss_actor": self._loss_actor}
+
+    def check_parameters(self, update: int) -> None:
+        """Refuse networks that are spoilt already: a finite loss may have had a gradient that is not.
+
+        Raises:
+            DivergenceError: with the update and the parameter.
+        """
+        for name, parameter in self.loss.named_parameters():
+            if not parameter.isfinite().all():
+                raise DivergenceError(f"update {update}: {name} is not finite")
 
     def weights_and_rate(self, k: int, progress: float) -> dict[str, float]:
         """The loss weights and the learning rate of the k-th update."""
@@ -98,12 +109,14 @@ class Learner:
     def state_dict(self) -> dict[str, Any]:
         return {
             "loss": self.loss.state_dict(),
+            "loss_actor": self._loss_actor,
             "critic_optimizer": self.critic_optimizer.state_dict(),
             "actor_optimizer": self.actor_optimizer.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.loss.load_state_dict(state["loss"])
+        self._loss_actor = state["loss_actor"]
         self.critic_optimizer.load_state_dict(state["critic_optimizer"])
         self.actor_optimizer.load_state_dict(state["actor_optimizer"])
 
@@ -115,6 +128,17 @@ class Learner:
         for optimizer in (self.critic_optimizer, self.actor_optimizer):
             optimizer.param_groups[0]["lr"] = rate
 
+    def _evaluate(self, name: str, batch: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """A loss of the module, compiled where that works."""
+        if self.compile:
+            try:
+                return self._compiled[name](batch)
+            except BackendCompilerFailed as error:
+                self.compile = False
+                reason = str(error).partition("\n")[0]
+                warnings.warn(f"updates run eagerly, two to three times slower: {reason}", stacklevel=3)
+        return getattr(self.loss, name)(batch)
+
     @staticmethod
     def _step(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
         optimizer.zero_grad()
@@ -122,31 +146,13 @@ class Learner:
         optimizer.step()
 
     @staticmethod
-    def _check(loss: Tensor, terms: dict[str, Tensor], k: int) -> None:
+    def _check(loss: Tensor, terms: dict[str, Tensor], update: int) -> None:
         if abs(loss.item()) < EXPLOSION:
             return
         found = ", ".join(f"{name} = {term.item():.3g}" for name, term in terms.items())
         worst = max(terms, key=lambda name: math.inf if math.isnan(value := terms[name].item()) else abs(value))
-        raise DivergenceError(f"update {k}: {worst} is not finite or exploded (above {EXPLOSION:.0e}): {found}")
+        raise DivergenceError(f"update {update}: {worst} is not finite or exploded (above {EXPLOSION:.0e}): {found}")
 
 
 def _adam(params, rate: float) -> torch.optim.Adam:
     return torch.optim.Adam(list(params.parameters()), rate, fused=True)
-
-
-def _can_compile(device: torch.device) -> bool:
-    if device.type != "cpu":
-        return True
-    from torch._inductor import config, exc
-    from torch._inductor.cpp_builder import get_cpp_compiler
-
-    try:
-        found = shutil.which(get_cpp_compiler())
-    except exc.InvalidCxxCompiler:
-        found = None
-    if found is None:
-        names = ", ".join(str(name) for name in config.cpp.cxx if name)
-        warnings.warn(
-            f"no C++ compiler found (tried {names}): the update runs eagerly, two to three times slower", stacklevel=2
-        )
-    return found is not None

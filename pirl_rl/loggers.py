@@ -11,6 +11,8 @@ from typing import Any, Literal, Protocol
 
 from torchrl.record.loggers import get_logger
 
+from pirl_rl.files import replacing
+
 METRICS_FILE = "metrics.csv"
 
 
@@ -48,13 +50,11 @@ class CSVLogger:
         columns, rows = self._read()
         if not columns:
             return
-        draft = self.path.with_suffix(".draft")
-        with draft.open("w", newline="") as file:
+        with replacing(self.path) as file:
             writer = csv.DictWriter(file, columns)
             writer.writeheader()
             # A row cut short by a kill has no update, or one that comes again.
             writer.writerows(row for row in rows if (row["update"] or "").isdigit() and int(row["update"]) <= update)
-        os.replace(draft, self.path)
 
     def close(self) -> None:
         pass
@@ -80,11 +80,13 @@ class TorchRLLogger(CSVLogger):
 
     def open(self, folder: Path, config: Mapping[str, Any]) -> None:
         super().open(folder, config)
-        extra = {}
+        name, extra = self.kind, {}
         if self.kind == "wandb":
+            name = folder.name
+            os.environ.setdefault("WANDB_CACHE_DIR", str(folder / "wandb" / "cache"))
             offline = "WANDB_MODE" not in os.environ and not _has_wandb_account()
             extra = {"wandb_kwargs": {"project": self.project, "offline": offline, "config": dict(config)}}
-        self.logger = get_logger(self.kind, logger_name=str(folder), experiment_name=folder.name, **extra)
+        self.logger = get_logger(self.kind, logger_name=str(folder), experiment_name=name, **extra)
 
     def log(self, row: Mapping[str, float]) -> None:
         super().log(row)

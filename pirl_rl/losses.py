@@ -15,12 +15,12 @@ from typing import Literal
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.objectives import TD3Loss
 
 from pirl_rl.networks import Actor, Critic
-from pirl_rl.operators import generator, require_twice_differentiable
-from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.operators import advection, generator, require_twice_differentiable
+from pirl_rl.problem import ReachAvoidProblem, has_controlled_noise
 
 WEIGHTS = ("td_weight", "hjb_weight", "boundary_weight")
 
@@ -40,6 +40,9 @@ class PIRLLoss(TD3Loss):
         noise_clip: bound of that noise.
         hjb_noise: deviation of the noise on the action of the HJB residual; biases V low, 0 by default.
         hjb_noise_clip: bound of that noise.
+        hjb_delta: HJB residuals beyond it, 1/s, count linearly (Huber), so that corners where V jumps and no network
+            can follow do not outweigh the rest; None squares all, as in the paper.
+        boundary_delta: the same for the error of V on the boundary.
         actor_rule: "q" ascends Q_1(y, pi(y)), Eq. (actor_loss); "hamiltonian" ascends f(x, pi) . grad V +
             1/2 Tr(sigma sigma^T hess V) at fixed V, the HJB equation's own rule; "both" adds them.
         td_weight, hjb_weight, boundary_weight: initial weights of the three terms.
@@ -61,6 +64,8 @@ class PIRLLoss(TD3Loss):
         noise_clip: float = 0.5,
         hjb_noise: float = 0.0,
         hjb_noise_clip: float = 1.0,
+        hjb_delta: float | None = None,
+        boundary_delta: float | None = None,
         actor_rule: Literal["q", "hamiltonian", "both"] = "both",
         td_weight: float = 1.0,
         hjb_weight: float = 0.0,
@@ -68,24 +73,34 @@ class PIRLLoss(TD3Loss):
     ):
         if actor_rule not in ("q", "hamiltonian", "both"):
             raise ValueError(f"loss.actor_rule: expected 'q', 'hamiltonian' or 'both', got {actor_rule!r}")
+        if actor_rule != "hamiltonian" and not all(critic.action_input for critic in critics):
+            raise ValueError(f"loss.actor_rule: critics without the action need 'hamiltonian', got {actor_rule!r}")
         for critic in critics:
             require_twice_differentiable(critic.layers)
         one = torch.ones(problem.controls.dim)
+        modules = [
+            TensorDictModule(critic, in_keys=["tau", "state", "action"], out_keys=["state_action_value"])
+            for critic in critics
+        ]
+        own = torch.stack([TensorDict.from_module(module).data.clone() for module in modules])
         super().__init__(
             TensorDictModule(actor, in_keys=["tau", "state"], out_keys=["action"]),
-            [
-                TensorDictModule(critic, in_keys=["tau", "state", "action"], out_keys=["state_action_value"])
-                for critic in critics
-            ],  # type: ignore[arg-type]
+            # A list of one would be expanded without parameters; a module alone is re-drawn, hence the copy below.
+            modules if len(modules) > 1 else modules[0],  # type: ignore[arg-type]
             bounds=(-one, one),  # type: ignore[arg-type]
             num_qvalue_nets=len(critics),
             policy_noise=policy_noise,
             noise_clip=noise_clip,
             loss_function="l2",
         )
+        self.qvalue_network_params.data.copy_(own)
+        self.target_qvalue_network_params.data.copy_(own)
         self.make_value_estimator(gamma=1.0)
         self.problem = problem
-        self.hjb_noise, self.hjb_noise_clip, self.actor_rule = hjb_noise, hjb_noise_clip, actor_rule
+        self.hjb_noise, self.hjb_noise_clip = hjb_noise, hjb_noise_clip
+        self.hjb_delta, self.boundary_delta = hjb_delta, boundary_delta
+        self.actor_rule = actor_rule
+        self._hamiltonian_operator = generator if has_controlled_noise(problem) else advection
         for name, value in zip(WEIGHTS, (td_weight, hjb_weight, boundary_weight), strict=True):
             self.register_coeff_buffer(name, float(value))
 
@@ -171,7 +186,8 @@ class PIRLLoss(TD3Loss):
                 action = (action + self._clipped_noise(action, self.hjb_noise, self.hjb_noise_clip)).clamp(-1, 1)
             u = self.problem.controls.denormalize(action)
         residual = self.residuals(points["tau"].squeeze(-1), points["state"], action, u)
-        return _masked_mean(residual.square().sum(0), points["mask"])
+        squares = _huber(residual, self.hjb_delta)
+        return _masked_mean(squares.sum(0), points["mask"])
 
     def _boundary_loss(self, points: TensorDictBase) -> Tensor:
         """L_BC summed over critics: the mean of (Q_i(y, pi^-(y)) - l_eps)^2."""
@@ -179,7 +195,7 @@ class PIRLLoss(TD3Loss):
             action = self.act(points["tau"], points["state"], target=True)
         with self.critics() as critic:
             value = critic(points["tau"], points["state"], action).squeeze(-1)
-        return (value - points["value"]).square().sum(0).mean()
+        return _huber(value - points["value"], self.boundary_delta).sum(0).mean()
 
     def _hamiltonian(self, points: TensorDictBase) -> Tensor:
         """Mean over points of f(x, u) . grad V + 1/2 Tr(sigma sigma^T hess V) and a term without u, Eq. (generator).
@@ -190,7 +206,7 @@ class PIRLLoss(TD3Loss):
         action = self.act(tau, x)
         u = self.problem.controls.denormalize(action)
         with self.critics("frozen") as critic:
-            value = generator(critic.at(action.detach()), self.problem, tau.squeeze(-1), x, u).mean(0)
+            value = self._hamiltonian_operator(critic.at(action.detach()), self.problem, tau.squeeze(-1), x, u).mean(0)
         mask = points["mask"] if "mask" in points.keys() else torch.ones_like(value, dtype=torch.bool)
         return _masked_mean(value, mask)
 
@@ -199,5 +215,12 @@ class PIRLLoss(TD3Loss):
         return (torch.randn_like(like) * deviation).clamp(-bound, bound)
 
 
+def _huber(residual: Tensor, delta: float | None) -> Tensor:
+    """r^2, or with a delta 2 delta |r| - delta^2 beyond it."""
+    if delta is None:
+        return residual.square()
+    return 2 * nn.functional.huber_loss(residual, torch.zeros_like(residual), reduction="none", delta=delta)
+
+
 def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    return (values * mask).sum() / mask.sum().clamp(min=1)
+    return torch.where(mask, values, torch.zeros_like(values)).sum() / mask.sum().clamp(min=1)

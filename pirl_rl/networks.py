@@ -7,11 +7,15 @@ losses hold them, one call evaluates all critics, (critics, N, 1).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from pirl_rl.problem import ReachAvoidProblem
+
+ROOT_TIME_OFFSET = 1e-4
+"""tau_0 of `RootTime` as a fraction of the horizon."""
 
 
 class Dense(nn.Linear):
@@ -35,14 +39,43 @@ class Scaling(nn.Module):
         return x * self.scale.unsqueeze(-2) + self.shift.unsqueeze(-2)
 
 
-def _stack(problem: ReachAvoidProblem, width_in: int, hidden, width_out: int, activation, output) -> nn.Sequential:
+class RootTime(nn.Module):
+    """Appends sqrt(tau + tau_0) to inputs (*, d) whose first entry is the time to go.
+
+    Where data jump at tau = 0, V spreads over a width of sqrt(tau): in the root of time that is a wedge, which a small
+    network can follow into the corner. tau_0 > 0 bounds the slope 1/(2 sqrt(tau + tau_0)) at tau = 0.
+    """
+
+    def __init__(self, tau_0: float):
+        super().__init__()
+        self.tau_0 = tau_0
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.cat([x, torch.sqrt(x[..., :1] + self.tau_0)], -1)
+
+
+def _stack(
+    problem: ReachAvoidProblem,
+    controls: int,
+    hidden: Sequence[int],
+    outputs: int,
+    activation: str,
+    output: str | None,
+    root_time: bool,
+) -> nn.Sequential:
     low, high = (0.0, *problem.states.low), (problem.horizon, *problem.states.high)
-    extra = width_in - len(low)
-    layers: list[nn.Module] = [Scaling((*low, *[-1.0] * extra), (*high, *[1.0] * extra))]
+    low, high = (*low, *[-1.0] * controls), (*high, *[1.0] * controls)
+    layers: list[nn.Module] = []
+    if root_time:
+        tau_0 = ROOT_TIME_OFFSET * problem.horizon
+        layers.append(RootTime(tau_0))
+        low, high = (*low, tau_0**0.5), (*high, (problem.horizon + tau_0) ** 0.5)
+    layers.append(Scaling(low, high))
+    width = len(low)
     for wide in hidden:
-        layers += [Dense(width_in, wide), getattr(nn, activation)()]
-        width_in = wide
-    return nn.Sequential(*layers, Dense(width_in, width_out), getattr(nn, output)())
+        layers += [Dense(width, wide), getattr(nn, activation)()]
+        width = wide
+    return nn.Sequential(*layers, Dense(width, outputs), *([] if output is None else [getattr(nn, output)()]))
 
 
 def _xavier(layers: nn.Sequential) -> None:
@@ -63,31 +96,44 @@ class Actor(nn.Module):
 
     def __init__(self, problem: ReachAvoidProblem, hidden: Sequence[int] = (32, 32), activation: str = "ReLU"):
         super().__init__()
-        inputs = 1 + problem.states.dim
-        self.layers = _stack(problem, inputs, hidden, problem.controls.dim, activation, "Tanh")
+        self.layers = _stack(problem, 0, hidden, problem.controls.dim, activation, "Tanh", root_time=False)
 
     def forward(self, tau: Tensor, state: Tensor) -> Tensor:
         return self.layers(torch.cat([tau, state], -1))
 
 
 class Critic(nn.Module):
-    """Q(tau, x, u): a probability, (*, 1), (*, n), (*, m) -> (*, 1) in (0, 1); u normalised.
+    """Q(tau, x, u), or V(tau, x): a probability, (*, 1), (*, n), (*, m) -> (*, 1); u normalised.
 
     Args:
         problem: gives the scaling and the sizes.
         hidden: widths of the hidden layers.
         activation: name of a module of `torch.nn`; C^2 where an HJB residual is taken.
+        action_input: True is Q, as in the paper; its derivatives at a frozen u are those of holding u for ever. False
+            is V: the action is ignored, derivatives are those of the policy's value, and transitions must be played
+            without noise.
+        root_time: whether sqrt(tau) is an input beside tau, see `RootTime`.
+        output: "Sigmoid" keeps probabilities in (0, 1), as in the paper, but reaches 0 or 1 at a face only in the limit
+            of infinite weights; None is linear, and meets a face as V does.
     """
 
-    def __init__(self, problem: ReachAvoidProblem, hidden: Sequence[int] = (32, 32, 32), activation: str = "Tanh"):
+    def __init__(
+        self,
+        problem: ReachAvoidProblem,
+        hidden: Sequence[int] = (32, 32, 32),
+        activation: str = "Tanh",
+        action_input: bool = True,
+        root_time: bool = True,
+        output: Literal["Sigmoid"] | None = None,
+    ):
         super().__init__()
-        inputs = 1 + problem.states.dim + problem.controls.dim
-        self.layers = _stack(problem, inputs, hidden, 1, activation, "Sigmoid")
+        self.action_input = action_input
+        controls = problem.controls.dim if action_input else 0
+        self.layers = _stack(problem, controls, hidden, 1, activation, output, root_time)
         _xavier(self.layers)
 
-    @staticmethod
-    def inputs(tau: Tensor, state: Tensor, action: Tensor) -> Tensor:
-        return torch.cat([tau, state, action], -1)
+    def inputs(self, tau: Tensor, state: Tensor, action: Tensor) -> Tensor:
+        return torch.cat([tau, state, action] if self.action_input else [tau, state], -1)
 
     def forward(self, tau: Tensor, state: Tensor, action: Tensor) -> Tensor:
         return self.layers(self.inputs(tau, state, action))

@@ -3,14 +3,14 @@
     L^u V = -d_tau V + f(x, u) . grad_x V + 1/2 Tr(sigma sigma^T hess_x V).
 
 Fast path. By Ito's lemma, along dX = f dt + sigma dW with the time to go running down, every activation z of a network
-is itself an Ito process dz = a dt + s dW. Starting from the input (tau, x) with drift (-1, f) and one column (0, sigma_j)
-per noise channel, layers carry (z, a, s):
+is itself an Ito process dz = a dt + s dW. Starting from the input (tau, x) with drift (-1, f) and one column
+(0, sigma_j) per noise channel, layers carry (z, a, s):
 
 - an affine map acts linearly on a and s and its bias on z alone;
 - an activation phi gives (phi(z), phi'(z) a + 1/2 phi''(z) |s|^2, phi'(z) s).
 
-The drift of the output is L^u V: 2 + w forward passes in one matrix product per layer, no graph of derivatives, so one
-backward pass reaches the parameters through the Hessian, and the whole compiles. Any other callable goes through
+The drift of the output is L^u V: the work of 2 + w forward passes and no graph of derivatives, so one backward pass
+reaches the parameters through the Hessian, and the whole compiles. Any other callable goes through
 forward-mode `torch.func`.
 """
 
@@ -21,7 +21,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from pirl_rl.networks import CriticValue, Dense, Scaling
+from pirl_rl.networks import CriticValue, Dense, RootTime, Scaling
 from pirl_rl.problem import ReachAvoidProblem
 
 ValueFunction = Callable[[Tensor, Tensor], Tensor]
@@ -71,7 +71,15 @@ def generator(value: ValueFunction, problem: ReachAvoidProblem, tau: Tensor, x: 
     Returns:
         (N,), or (critics, N), in 1/s.
     """
-    f, sigma = problem.drift(x, u), problem.diffusion(x, u)
+    return _along(value, tau, x, problem.drift(x, u), problem.diffusion(x, u))
+
+
+def advection(value: ValueFunction, problem: ReachAvoidProblem, tau: Tensor, x: Tensor, u: Tensor) -> Tensor:
+    """-d_tau V + f(x, u) . grad_x V: all of L^u V that depends on u where the noise does not. As `generator`."""
+    return _along(value, tau, x, problem.drift(x, u), x.new_zeros((*x.shape, 0)))
+
+
+def _along(value: ValueFunction, tau: Tensor, x: Tensor, f: Tensor, sigma: Tensor) -> Tensor:
     if isinstance(value, CriticValue):
         return _ito_drift(value, tau, x, f, sigma)
     return _forward_mode(value, tau, x, f, sigma)
@@ -89,6 +97,11 @@ def _ito_drift(value: CriticValue, tau: Tensor, x: Tensor, f: Tensor, sigma: Ten
 
 def _propagate(layer: nn.Module, z: Tensor, a: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Carry value and drift (*, N, d) and columns (*, w, N, d) through one layer."""
+    if isinstance(layer, RootTime):
+        # d sqrt(tau + tau_0) = d tau / (2 sqrt(tau + tau_0)), and time has no noise.
+        root = layer(z)
+        rate = 1 / (2 * root[..., -1:])
+        return root, torch.cat([a, a[..., :1] * rate], -1), nn.functional.pad(s, (0, 1))
     if isinstance(layer, Scaling):
         return layer(z), a * layer.scale.unsqueeze(-2), s * layer.scale[..., None, None, :]
     if isinstance(layer, Dense):
@@ -117,7 +130,7 @@ def require_twice_differentiable(layers: nn.Sequential) -> None:
         TypeError: naming the layer and the activations that can stand in its place.
     """
     for layer in layers:
-        if not isinstance(layer, (Scaling, Dense)) and type(layer) not in ACTIVATIONS:
+        if not isinstance(layer, (RootTime, Scaling, Dense)) and type(layer) not in ACTIVATIONS:
             known = ", ".join(sorted(kind.__name__ for kind in ACTIVATIONS))
             raise TypeError(
                 f"critic: the HJB residual takes second derivatives, so every activation must be C^2; "

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 
@@ -61,5 +62,8 @@ class SmoothPayoff(_Smoothed):
     """A C^3 payoff, as the paper's Assumption 2 (c) asks: the septic smoothstep of the same ramp."""
 
     def __call__(self, level: Tensor) -> Tensor:
-        s = self._ramp(level)
-        return s**4 * (35 - 84 * s + 70 * s**2 - 20 * s**3)
+        ramp = self._ramp(level)
+        s = torch.minimum(ramp, 1 - ramp)
+        rise = s**4 * (35 - 84 * s + 70 * s**2 - 20 * s**3)
+        # Symmetric about 1/2; rounding in the polynomial near s = 1 would exceed 1.
+        return torch.where(ramp < 0.5, rise, 1 - rise)

@@ -44,12 +44,12 @@ def draw_run(solution: Solution, metrics_path: str | Path, folder: str | Path) -
     """Draw a run's figures into `folder`: training curves, and in one dimension surface, heat maps and policy.
 
     Args:
-        metrics_path: the run's metrics.csv.
+        metrics_path: the run's metrics.csv; without one there are no training curves.
 
     Returns:
         The files written.
     """
-    figures = {"training": draw_training(read_metrics(metrics_path))}
+    figures = {"training": draw_training(read_metrics(metrics_path))} if Path(metrics_path).is_file() else {}
     if solution.problem.states.dim == 1:
         grid = solve_on_grid(solution)
         figures |= {"surface": draw_surface(grid), "value": draw_value(grid), "policy": draw_policy(grid, solution)}

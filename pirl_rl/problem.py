@@ -118,13 +118,21 @@ class ReachAvoidProblem(ABC):
         return ~(self.reached(x) | self.failed(x))
 
     def boundary_value(self, x: Tensor) -> Tensor:
-        """V on the parabolic boundary, Eq. (parabolic_boundary): l_eps at tau = 0 and in A_eps, 0 in B. (*, n) -> (*)."""
+        """V on the parabolic boundary (*, n) -> (*), Eq. (parabolic_boundary): l_eps at tau = 0 and in A_eps, 0 in B."""
         alive = (~self.failed(x)).to(x.dtype)
         if self.objective == "invariance":
             return alive
         if self.payoff.epsilon == 0:
             return alive * self.payoff(self.target_level(x))
         return alive * self.payoff(_normalized(self.target_constraints, x).amax(-1))
+
+
+def has_controlled_noise(problem: ReachAvoidProblem, points: int = 256, seed: int = 0) -> bool:
+    """Whether sigma depends on u, found on sampled states and pairs of controls."""
+    generator = torch.Generator().manual_seed(seed)
+    x = problem.states.sample(points, generator)
+    one, other = (problem.diffusion(x, problem.controls.sample(points, generator)) for _ in range(2))
+    return not torch.equal(one, other)
 
 
 def _normalized(levels, x: Tensor) -> Tensor:
@@ -159,6 +167,7 @@ def check_problem(problem: ReachAvoidProblem, points: int = 100_000, seed: int =
     if sigma.ndim != 3:
         raise ProblemError(f"{name}.diffusion: expected shape (*, {n}, w), got {tuple(sigma.shape)} for 16 states")
     _expect_shape(f"{name}.diffusion", sigma, (16, n, sigma.shape[-1]))
+    _expect_shape(f"{name}.avoid_level", problem.avoid_level(few), (16,))
     if problem.objective == "reach-avoid":
         _expect_shape(f"{name}.target_level", problem.target_level(few), (16,))
         both = (problem.target_level(x) <= 0) & problem.failed(x)
@@ -168,7 +177,6 @@ def check_problem(problem: ReachAvoidProblem, points: int = 100_000, seed: int =
                 f"{name}: target and avoid set overlap, expected disjoint sets; {int(both.sum())} of {points} "
                 f"sampled points lie in both, for example x = {point}"
             )
-    _expect_shape(f"{name}.avoid_level", problem.avoid_level(few), (16,))
 
 
 def _expect_shape(what: str, value: Tensor, shape: tuple[int, ...]) -> None:

@@ -1,4 +1,4 @@
-"""Runs: a trainer from a configuration, and a finished run from its directory."""
+"""Runs: a trained solution, opened from its directory."""
 
 from __future__ import annotations
 
@@ -9,65 +9,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torch import Tensor
 
 from pirl_rl import checkpoint
+from pirl_rl.assembly import fitting, make_loss
+from pirl_rl.checkpoint import CheckpointError
 from pirl_rl.configuration import build, load_config
-from pirl_rl.envs import ReachAvoidEnv
-from pirl_rl.losses import PIRLLoss
-from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
-from pirl_rl.trainer import Trainer
-
-
-def pick_device(name: str) -> torch.device:
-    """ "auto" is CUDA where there is one."""
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    return torch.device(name)
-
-
-def make_loss(config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[str] = ()) -> PIRLLoss:
-    """Fresh networks in their loss."""
-    actor = build(config.actor, "actor", trust, problem=problem)
-    critics = [build(config.critic, "critic", trust, problem=problem) for _ in range(config.critics)]
-    return build(config.loss, "loss", trust, problem=problem, actor=actor, critics=critics).to(
-        pick_device(config.device)
-    )
-
-
-def make_trainer(config: DictConfig, folder: Path | None = None, trust: Sequence[str] = ()) -> Trainer:
-    """Everything a configuration names, put together; nothing is written yet.
-
-    Raises:
-        ConfigError: naming the key, what was expected and what was got.
-    """
-    device = pick_device(config.device)
-    torch.manual_seed(config.seed)
-    env: ReachAvoidEnv = build(config.env, "env", trust, seed=config.seed, device=device)
-    problem = env.problem
-    loss = make_loss(config, problem, trust)
-    schedule = build(config.schedule, "schedule", trust)
-    learner = build(config.learner, "learner", trust, loss=loss, schedule=schedule)
-    actor = loss.actor_network.module
-    evaluation = config.evaluation
-    return build(
-        config.trainer,
-        "trainer",
-        trust,
-        learner=learner,
-        collector=build(config.collector, "collector", trust, env=env, actor=actor, seed=config.seed),
-        collocation=build(config.collocation, "collocation", trust, problem=problem),
-        boundary=build(config.boundary, "boundary", trust, problem=problem),
-        during=[build(evaluation[name], f"evaluation.{name}", trust) for name in evaluation.during],
-        final=[build(evaluation[name], f"evaluation.{name}", trust) for name in evaluation.final],
-        logger=build(config.logger, "logger", trust),
-        folder=folder,
-        config=OmegaConf.to_container(config, resolve=True),
-        seed=config.seed,
-    )
 
 
 @dataclass(frozen=True)
@@ -152,8 +102,11 @@ def load_run(folder: str | Path, trust: Sequence[str] = (), weights: str = check
     folder = Path(folder)
     config = load_config(folder)
     config.device = device
-    problem = build(config.env.problem, "env.problem", trust)
-    loss = make_loss(config, problem, trust)
-    state = checkpoint.load(folder / "checkpoints" / weights, pick_device(device))
-    loss.load_state_dict(state.get("learner", state)["loss"])
-    return Run(Solution(loss), config, state["update"])
+    if Path(weights).name != weights:
+        raise CheckpointError(f"weights: expected the name of a file in {folder / checkpoint.FOLDER}, got {weights}")
+    path = folder / checkpoint.FOLDER / weights
+    state = checkpoint.load(path)
+    loss = make_loss(config, build(config.env.problem, "env.problem", trust), trust)
+    with fitting(path):
+        loss.load_state_dict(state.get("learner", state)["loss"])
+    return Run(Solution(loss), config, int(state["update"]))

@@ -39,9 +39,9 @@ class Solution:
 
     @torch.no_grad()
     def value(self, tau: Tensor, x: Tensor) -> Tensor:
-        """V (N,): exactly 1 where a path has succeeded, 0 where it failed or cannot succeed, else `raw_value`."""
+        """V (N,) in [0, 1]: 1 where a path has succeeded, 0 where it failed or cannot succeed, else `raw_value`."""
         lost = self.problem.failed(x) | self.problem.unreachable(x)
-        return self.raw_value(tau, x).masked_fill(self.problem.reached(x), 1.0).masked_fill(lost, 0.0)
+        return self.raw_value(tau, x).clamp(0, 1).masked_fill(self.problem.reached(x), 1.0).masked_fill(lost, 0.0)
 
     @torch.no_grad()
     def residual(self, tau: Tensor, x: Tensor, u: Tensor | None = None) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import signal
 import sys
 import time
@@ -19,12 +20,15 @@ from pirl_rl import checkpoint
 from pirl_rl.collectors import TransitionCollector
 from pirl_rl.collocation import BoundarySampler, Collocation
 from pirl_rl.evaluation import evaluate
-from pirl_rl.learner import Learner
+from pirl_rl.files import replacing
+from pirl_rl.learner import DivergenceError, Learner
 from pirl_rl.loggers import MetricsLogger, NoLogger
 from pirl_rl.solution import Solution
 
 Evaluator = Callable[[Solution], dict[str, float]]
-SHOWN = ("value_mse", "success_rate", "hjb_loss")
+EVALUATED = ("value_mse", "success_rate", "hjb_loss", "td_loss")
+TRAINED = ("train_td_loss", "train_hjb_loss", "train_boundary_loss")
+"""What the progress shows, of an evaluation and between evaluations."""
 
 
 class Interrupted(Exception):
@@ -90,10 +94,10 @@ class Trainer:
         self.config = dict(config or {})
         self.solution = Solution(learner.loss)
         self.rng = torch.Generator(self.solution.device).manual_seed(seed)
-        # A term whose weight is zero at both ends of the run is left out of the work.
-        ends = [learner.schedule(k) for k in (0, updates)]
-        self.physics = tuple(max(weights) > 0 for weights in zip(*ends, strict=True))[1:]
-        self.update, self.wall_seconds = 0, 0.0
+        # A term whose weight is zero all along the run is left out of the work.
+        weights = [learner.schedule(k) for k in (*range(0, updates, max(1, updates // 1_000)), updates)]
+        self.physics = tuple(max(values) > 0 for values in zip(*weights, strict=True))[1:]
+        self.update, self.saved, self.wall_seconds = 0, 0, 0.0
 
     def train(self) -> dict[str, float]:
         """Run to the last update; returns the summary.
@@ -106,16 +110,20 @@ class Trainer:
             self.logger.open(self.folder, self.config)
             self.logger.rewind(self.update)
         try:
-            self.collector.start()
-            self._loop()
+            with _interruptible() as interrupted:
+                self.collector.start()
+                self._loop(interrupted)
+        except DivergenceError as error:
+            kept = f"the checkpoint of update {self.saved} is kept" if self.saved else "there is no checkpoint yet"
+            raise DivergenceError(f"{error}; {kept}") from None
         finally:
             self.collector.close()
             self.logger.close()
         return self._finish()
 
-    def _loop(self) -> None:
+    def _loop(self, interrupted: Callable[[], bool]) -> None:
         begin = time.perf_counter() - self.wall_seconds
-        with _interruptible() as interrupted, _Progress(self.updates, self.update) as progress:
+        with _Progress(self.updates, self.update) as progress:
             for k in range(self.update, self.updates):
                 self.collector.step(k)
                 terms = self.learner.update(self.sample(), k, k / self.updates)
@@ -124,10 +132,11 @@ class Trainer:
                 if row:
                     self.logger.log(row)
                 progress.show(self.update, row)
-                last = self.update == self.updates
-                if last or interrupted() or (self.checkpoint_every and self.update % self.checkpoint_every == 0):
-                    self.save(keep_weights=not last and not interrupted())
-                if interrupted() and not last:
+                stop = interrupted() and self.update < self.updates
+                due = bool(self.checkpoint_every) and self.update % self.checkpoint_every == 0
+                if due or stop or self.update == self.updates:
+                    self.save(keep_weights=due and self.update < self.updates)
+                if stop:
                     raise Interrupted(self.update)
 
     def sample(self) -> TensorDict:
@@ -137,7 +146,7 @@ class Trainer:
             parts["collocation"] = self.collocation.sample(self.rng)
         if self.physics[1]:
             parts["boundary"] = self.boundary.sample(self.rng)
-        return TensorDict(parts)
+        return TensorDict(parts).to(self.solution.device)
 
     def _row(self, k: int, terms: Mapping[str, torch.Tensor]) -> dict[str, float]:
         """The metrics of an update, on those that log; empty on others."""
@@ -146,7 +155,7 @@ class Trainer:
             return {}
         row = {"update": self.update, **self.learner.weights_and_rate(k, k / self.updates)}
         for name in ("td_loss", "hjb_loss", "boundary_loss", "loss_actor"):
-            value = terms[name].item() if name in terms else float("nan")
+            value = terms[name].item() if name in terms else math.nan
             row[name if name.startswith("loss") else f"train_{name}"] = value
         if evaluates:
             row |= evaluate(self.solution, self.during)
@@ -160,22 +169,25 @@ class Trainer:
             **evaluate(self.solution, self.final),
         }
         if self.folder is not None:
-            draft = self.folder / ".summary.draft"
-            draft.write_text(json.dumps(summary, indent=2) + "\n")
-            draft.replace(self.folder / "summary.json")
+            with replacing(self.folder / "summary.json") as file:
+                file.write(json.dumps(summary, indent=2) + "\n")
         return summary
 
     def save(self, keep_weights: bool = False) -> None:
-        """Write `checkpoints/last.pt`, and the weights alone beside it if they are to be kept."""
+        """Write `checkpoints/last.pt`, and the weights alone beside it if they are to be kept.
+
+        Raises:
+            DivergenceError: where the networks are spoilt; the checkpoint before stays.
+        """
+        self.learner.check_parameters(self.update)
         if self.folder is None:
             return
-        folder = self.folder / "checkpoints"
+        folder = self.folder / checkpoint.FOLDER
         checkpoint.save(self.state_dict(), folder / checkpoint.LAST)
         if keep_weights:
-            checkpoint.save(
-                {"loss": self.learner.loss.state_dict(), "update": self.update},
-                checkpoint.weights_path(folder, self.update),
-            )
+            weights = {"loss": self.learner.loss.state_dict(), "update": self.update}
+            checkpoint.save(weights, checkpoint.weights_path(folder, self.update))
+        self.saved = self.update
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that an exact continuation needs, as tensors and plain values."""
@@ -191,30 +203,34 @@ class Trainer:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from a state; call before `train`."""
-        self.update, self.wall_seconds = state["update"], state["wall_seconds"]
+        self.update, self.saved, self.wall_seconds = state["update"], state["update"], state["wall_seconds"]
         self.learner.load_state_dict(state["learner"])
         self.collector.load_state_dict(state["collector"])
-        self.rng.set_state(state["rng"].cpu())
-        torch.set_rng_state(state["torch_rng"].cpu())
+        self.rng.set_state(state["rng"])
+        torch.set_rng_state(state["torch_rng"])
         if state["cuda_rng"] and torch.cuda.is_available():
-            torch.cuda.set_rng_state_all([entry.cpu() for entry in state["cuda_rng"]])
+            torch.cuda.set_rng_state_all(state["cuda_rng"])
 
 
 class _Progress:
-    """A bar on a terminal, plain lines at each evaluation elsewhere."""
+    """A bar on a terminal; elsewhere plain lines, at each evaluation and each tenth of the run."""
 
     def __init__(self, total: int, done: int):
         self.bar = tqdm(total=total, initial=done, unit="update", disable=None, dynamic_ncols=True)
-        self.total = total
+        self.total, self.shown = total, done
 
     def show(self, update: int, row: Mapping[str, float]) -> None:
-        self.bar.update(update - self.bar.n if not self.bar.disable else 0)
-        figures = {name: f"{row[name]:.3g}" for name in SHOWN if name in row}
-        if figures and self.bar.disable:
-            text = ", ".join(f"{name} {value}" for name, value in figures.items())
+        if not self.bar.disable:
+            self.bar.update(update - self.bar.n)
+        evaluated = any(name in row for name in EVALUATED)
+        names = EVALUATED if evaluated else TRAINED
+        text = ", ".join(f"{name} {row[name]:.3g}" for name in names if not math.isnan(row.get(name, math.nan)))
+        if not self.bar.disable:
+            if evaluated or (row and not self.bar.postfix):
+                self.bar.set_postfix_str(text)
+        elif evaluated or (row and update - self.shown >= self.total / 10):
             print(f"update {update}/{self.total}: {text}", file=sys.stderr, flush=True)
-        elif figures:
-            self.bar.set_postfix(figures)
+            self.shown = update
 
     def __enter__(self) -> _Progress:
         return self
@@ -232,6 +248,7 @@ def _interruptible() -> Iterator[Callable[[], bool]]:
         nonlocal asked
         asked = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        print("\nstopping after this update; Ctrl-C again stops at once", file=sys.stderr, flush=True)
 
     try:
         previous = signal.signal(signal.SIGINT, ask)

@@ -1,0 +1,116 @@
+"""From a configuration to a trainer, and back to where a checkpoint left it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+from pirl_rl import checkpoint
+from pirl_rl.checkpoint import CheckpointError
+from pirl_rl.configuration import ConfigError, build, convert
+from pirl_rl.envs import ReachAvoidEnv
+from pirl_rl.evaluation import Evaluator
+from pirl_rl.losses import PIRLLoss
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.trainer import Trainer
+
+
+def pick_device(name: str) -> torch.device:
+    """ "auto" is CUDA where there is one.
+
+    Raises:
+        ConfigError: an unknown name, or CUDA where there is none.
+    """
+    if name not in ("auto", "cpu", "cuda"):
+        raise ConfigError(f"device: expected auto, cpu or cuda, got {name!r}")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("device: expected a CUDA device for device=cuda, found none; use device=cpu or auto")
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def make_loss(config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[str] = ()) -> PIRLLoss:
+    """Fresh networks in their loss."""
+    actor = build(config.actor, "actor", trust, problem=problem)
+    count = convert(config.critics, Literal[1, 2], "critics")
+    critics = [build(config.critic, "critic", trust, problem=problem) for _ in range(count)]
+    with warnings.catch_warnings():
+        # The learner's SoftUpdate comes later, or never where nothing is trained.
+        warnings.filterwarnings("ignore", message="No target network updater")
+        loss = build(config.loss, "loss", trust, problem=problem, actor=actor, critics=critics)
+    return loss.to(pick_device(config.device))
+
+
+def make_trainer(config: DictConfig, folder: Path | None = None, trust: Sequence[str] = ()) -> Trainer:
+    """Everything a configuration names, put together; nothing is written yet.
+
+    Raises:
+        ConfigError: naming the key, what was expected and what was got.
+    """
+    device = pick_device(config.device)
+    seed = convert(config.seed, int, "seed")
+    if seed < 0:
+        raise ConfigError(f"seed: expected an integer >= 0, got {seed}")
+    # Streams of their own: noise of the physics, of the policy, sampling and collocation are not to repeat each other.
+    networks, physics, sampling, points = (int(word) for word in np.random.SeedSequence(seed).generate_state(4))
+    torch.manual_seed(networks)
+    env: ReachAvoidEnv = build(config.env, "env", trust, seed=physics, device=device)
+    problem = env.problem
+    loss = make_loss(config, problem, trust)
+    actor = loss.actor_network.module
+    schedule = build(config.schedule, "schedule", trust)
+    return build(
+        config.trainer,
+        "trainer",
+        trust,
+        learner=build(config.learner, "learner", trust, loss=loss, schedule=schedule),
+        collector=build(config.collector, "collector", trust, env=env, actor=actor, seed=sampling),
+        collocation=build(config.collocation, "collocation", trust, problem=problem),
+        boundary=build(config.boundary, "boundary", trust, problem=problem),
+        during=_evaluators(config.evaluation, "during", trust),
+        final=_evaluators(config.evaluation, "final", trust),
+        logger=build(config.logger, "logger", trust),
+        folder=folder,
+        config=OmegaConf.to_container(config, resolve=True),
+        seed=points,
+    )
+
+
+def _evaluators(config: DictConfig, when: str, trust: Sequence[str]) -> list[Evaluator]:
+    names = config[when]
+    known = [name for name in config if isinstance(config[name], DictConfig)]
+    if not isinstance(names, ListConfig) or not all(name in known for name in names):
+        raise ConfigError(f"evaluation.{when}: expected a list of names out of {', '.join(known)}, got {names}")
+    return [build(config[name], f"evaluation.{name}", trust) for name in names]
+
+
+def restore(trainer: Trainer) -> None:
+    """Put a trainer where its run directory's last checkpoint left it.
+
+    Raises:
+        CheckpointError: none there, a broken one, or one of another configuration.
+    """
+    assert trainer.folder is not None
+    path = trainer.folder / checkpoint.FOLDER / checkpoint.LAST
+    with fitting(path):
+        trainer.load_state_dict(checkpoint.load(path))
+    if trainer.update > trainer.updates:
+        raise ConfigError(f"trainer.updates: {trainer.folder} has done {trainer.update} already, got {trainer.updates}")
+
+
+@contextmanager
+def fitting(path: Path) -> Iterator[None]:
+    """Whatever does not fit while a checkpoint is loaded is told as such."""
+    try:
+        yield
+    except CheckpointError:
+        raise
+    except (RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
+        reason = " ".join(str(error).split())[:300]
+        raise CheckpointError(f"{path} does not fit the run's configuration: {reason}") from error

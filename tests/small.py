@@ -1,0 +1,82 @@
+"""Runs of seconds: the debug configuration, composed, built and compared."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import torch
+from hydra import compose, initialize_config_dir
+
+from pirl_rl.assembly import make_trainer, restore
+from pirl_rl.configuration import CONF, save_config
+from pirl_rl.trainer import Trainer
+
+QUICK = ("+experiment=reach1d", "+debug=default", "evaluation.final=[exact]", "evaluation.during=[exact]")
+# A buffer that wraps around, and events that fall on different updates.
+EVENTS = (
+    *("env.num_envs=64", "collector.frames_per_batch=128", "collector.updates_per_batch=3", "collector.n_steps=1"),
+    *("collector.warmup_frames=256", "collector.buffer_size=600", "collector.exploration=always"),
+    *("trainer.log_every=3", "trainer.evaluate_every=4", "trainer.checkpoint_every=5"),
+)
+
+
+def small_config(*overrides: str):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("train", [*QUICK, *overrides])
+
+
+def small_trainer(folder: Path, *overrides: str) -> Trainer:
+    config = small_config(*EVENTS, *overrides)
+    save_config(config, folder)
+    return make_trainer(config, folder)
+
+
+def resumed(folder: Path, *overrides: str) -> Trainer:
+    trainer = small_trainer(folder, *overrides)
+    restore(trainer)
+    return trainer
+
+
+def at_update(trainer: Trainer, update: int, action) -> None:
+    """Call an action just before an update, counted from 1."""
+    step = trainer.collector.step
+
+    def instead(k: int) -> None:
+        if k == update - 1:
+            action()
+        step(k)
+
+    trainer.collector.step = instead
+
+
+def interrupt() -> None:
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def assert_same(a, b, path: str = "state") -> None:
+    """Equal bit for bit, but for the time taken."""
+    assert type(a) is type(b), path
+    if isinstance(a, torch.Tensor):
+        assert torch.equal(a, b), path
+    elif isinstance(a, dict):
+        assert a.keys() == b.keys(), path
+        for key in a.keys() - {"wall_seconds"}:
+            assert_same(a[key], b[key], f"{path}.{key}")
+    elif isinstance(a, (list, tuple)):
+        assert len(a) == len(b), path
+        for index, pair in enumerate(zip(a, b, strict=True)):
+            assert_same(*pair, f"{path}[{index}]")
+    else:
+        assert a == b, path
+
+
+def command(*arguments: str, cwd: Path, module: str = "pirl_rl.train", **environment: str):
+    """A real command line, from a directory of the test's own."""
+    path = os.pathsep.join(filter(None, [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]))
+    environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", **environment}
+    line = [sys.executable, "-m", module, *arguments]
+    return subprocess.run(line, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300)

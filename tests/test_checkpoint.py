@@ -1,0 +1,150 @@
+"""Checkpoints survive kills, and foreign files run nothing."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+from small import resumed, small_trainer
+
+from pirl_rl import load_run
+from pirl_rl.checkpoint import LAST, CheckpointError, load, save
+
+STATE = {"loss": {"weight": torch.arange(1000.0)}, "update": 3, "rng": torch.get_rng_state(), "names": ("a", 1, None)}
+
+WRITER = """
+import sys, torch
+from pathlib import Path
+from pirl_rl.checkpoint import save
+for k in range(10_000):
+    save({"loss": {"weight": torch.full((200_000,), float(k))}, "update": k}, Path(sys.argv[1]))
+"""
+
+
+class Payload:
+    """Runs a command when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.system, (f"touch {self.path}",)
+
+
+def test_round_trip(tmp_path):
+    save(STATE, tmp_path / "a" / LAST)
+    back = load(tmp_path / "a" / LAST)
+    assert torch.equal(back["loss"]["weight"], STATE["loss"]["weight"])
+    assert back["names"] == STATE["names"]
+    assert [path.name for path in (tmp_path / "a").iterdir()] == [LAST]
+
+
+@pytest.mark.parametrize("form", ["pickle", "torch"])
+def test_hostile_pickle_runs_nothing(form, tmp_path):
+    path, proof = tmp_path / LAST, tmp_path / "ran"
+    hostile = {"loss": Payload(proof), "update": 1}
+    path.write_bytes(pickle.dumps(hostile)) if form == "pickle" else torch.save(hostile, path)
+    with pytest.raises(CheckpointError, match=LAST):
+        load(path)
+    assert not proof.exists()
+
+
+def test_broken_files_are_told_as_such(tmp_path):
+    save(STATE, tmp_path / LAST)
+    good = (tmp_path / LAST).read_bytes()
+    broken = tmp_path / "broken.pt"
+    cuts = [0, 1, 100, len(good) // 2, len(good) - 1]
+    for content in [*(good[:cut] for cut in cuts), b"\0" * 500, b"\x80\x02}q\x00."]:
+        broken.write_bytes(content)
+        with pytest.raises(CheckpointError, match=r"broken\.pt"):
+            load(broken)
+    torch.save([1, 2], broken)
+    with pytest.raises(CheckpointError, match="no loss module"):
+        load(broken)
+    with pytest.raises(CheckpointError, match="no checkpoint at"):
+        load(tmp_path / "absent.pt")
+
+
+def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
+    path = tmp_path / LAST
+    save(STATE, path)
+    before = path.read_bytes()
+    with pytest.raises(AttributeError, match="pickle"):
+        save({"half": torch.ones(1000), "rest": lambda: None}, path)
+    assert path.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == [LAST]
+
+
+def test_a_link_under_the_drafts_name_is_not_followed(tmp_path):
+    precious = tmp_path / "precious"
+    precious.write_text("mine")
+    (tmp_path / f".{LAST}.draft").symlink_to(precious)
+    save(STATE, tmp_path / LAST)
+    assert precious.read_text() == "mine"
+
+
+def test_every_checkpoint_of_a_killed_writer_loads(tmp_path):
+    path = tmp_path / LAST
+    save({"loss": {"weight": torch.zeros(1)}, "update": -1}, path)
+    rng = random.Random(0)
+    for _ in range(3):
+        child = subprocess.Popen([sys.executable, "-c", WRITER, str(path)])
+        first = path.stat().st_mtime_ns
+        while path.stat().st_mtime_ns == first:
+            assert child.poll() is None, "the writer ended before its first checkpoint"
+            time.sleep(0.01)
+        time.sleep(rng.uniform(0, 0.05))
+        child.kill()
+        child.wait()
+        state = load(path)
+        assert (state["loss"]["weight"] == state["update"]).all()
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    small_trainer(folder, "trainer.updates=5").train()
+    return folder
+
+
+def test_weights_are_files_of_the_run(run, tmp_path):
+    assert load_run(run).update == 5
+    save({"loss": {}, "update": 1}, tmp_path / "elsewhere.pt")
+    for weights in ("../../elsewhere.pt", str(tmp_path / "elsewhere.pt")):
+        with pytest.raises(CheckpointError, match="weights"):
+            load_run(run, weights=weights)
+    save({"loss": {"x": torch.ones(1)}, "update": 1}, run / "checkpoints" / "other.pt")
+    with pytest.raises(CheckpointError, match="does not fit"):
+        load_run(run, weights="other.pt")
+
+
+@pytest.mark.slow
+def test_killed_training_at_twenty_random_moments(tmp_path):
+    """Every checkpoint left behind loads, and training goes on from there, each time until the next kill."""
+    rng, folder = random.Random(1), tmp_path / "run"
+    small_trainer(folder, "trainer.updates=1000000", "trainer.checkpoint_every=2", "evaluation.during=[]").save()
+    reached = 0
+    for _ in range(20):
+        child = subprocess.Popen(
+            [sys.executable, "-m", "pirl_rl.train", f"resume={folder}"],
+            cwd=os.path.dirname(os.path.dirname(__file__)),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        while load(folder / "checkpoints" / LAST)["update"] == reached:
+            assert child.poll() is None, "training ended by itself"
+            time.sleep(0.02)
+        time.sleep(rng.uniform(0, 1))
+        os.kill(child.pid, signal.SIGKILL)
+        child.wait()
+        for path in (folder / "checkpoints").glob("*.pt"):
+            load(path)
+        reached = load(folder / "checkpoints" / LAST)["update"]
+    assert resumed(folder, "trainer.updates=1000000").update == reached >= 40

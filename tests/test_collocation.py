@@ -1,0 +1,163 @@
+"""Interior points and the parabolic boundary."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from oracles import PROBLEMS, Corner, name
+
+from pirl_rl.collocation import BoundarySampler, Collocation
+from pirl_rl.problem import ProblemError
+from pirl_rl.problems import Reach1D, Safety1D
+from pirl_rl.sets import Box
+
+SAMPLERS = pytest.mark.parametrize("sampler", ["uniform", "sobol"])
+problems = pytest.mark.parametrize("problem", [*PROBLEMS, Corner()], ids=name)
+
+
+def rng(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+@problems
+@SAMPLERS
+def test_interior_points_lie_in_the_box_and_are_masked_where_the_equation_does_not_hold(problem, sampler):
+    points = Collocation(problem, 3_000, sampler, widen=1.5).sample(rng())
+    tau, x, mask = points["tau"], points["state"], points["mask"]
+    assert (tau.shape, x.shape, mask.shape) == ((3_000, 1), (3_000, problem.states.dim), (3_000,))
+    assert (tau > 0).all()
+    assert (tau <= problem.horizon).all()
+    assert problem.states.expand(1.5 + 1e-5).contains(x).all()
+    assert torch.equal(mask, ~(problem.reached(x) | problem.failed(x)))
+    assert 0 < mask.sum() < 3_000
+
+
+@problems
+def test_points_outside_time_are_masked(problem):
+    x = Collocation(problem, 200).sample(rng())["state"]
+    x = x[problem.interior(x)][:3]
+    x = x[:1].expand(4, -1)
+    tau = problem.horizon * torch.tensor([[-0.1], [0.0], [1.0], [1.01]])
+    assert Collocation(problem).mask(tau, x).tolist() == [False, False, True, False]
+
+
+@SAMPLERS
+def test_widened_box_is_covered_to_its_edges(sampler):
+    x = Collocation(Reach1D(), 4_000, sampler, widen=2.0).sample(rng())["state"]
+    assert x.abs().max() > 3.95
+    assert x.mean().item() == pytest.approx(0, abs=5 * (16 / 3 / 4_000) ** 0.5)
+
+
+def test_sobol_points_are_more_even_than_random_ones():
+    """2^10 scrambled points: each of 32 equal strips of either axis has its share, up to one point."""
+    problem = Reach1D()
+    points = Collocation(problem, 1024, "sobol").sample(rng())
+    for unit in (points["tau"] / problem.horizon, (points["state"] + 2) / 4):
+        counts = torch.histc(unit, 32, 0, 1)
+        assert (counts - 32).abs().max() <= 1
+    random = Collocation(problem, 1024, "uniform").sample(rng())
+    assert (torch.histc((random["state"] + 2) / 4, 32, 0, 1) - 32).abs().max() > 5
+
+
+@pytest.mark.parametrize("power", [1.0, 2.0])
+@SAMPLERS
+def test_law_of_tau(sampler, power):
+    """E[tau] = T/(power + 1), within five standard errors of random points."""
+    tau = Collocation(Reach1D(), 20_000, sampler, tau_power=power).sample(rng())["tau"]
+    deviation = (4 / (2 * power + 1) - (2 / (power + 1)) ** 2) ** 0.5
+    assert tau.mean().item() == pytest.approx(2 / (power + 1), abs=5 * deviation / 20_000**0.5)
+
+
+@SAMPLERS
+def test_same_generator_same_points_and_no_draw_repeats(sampler):
+    collocation, generator = Collocation(Reach1D(), 64, sampler), rng()
+    first, second = collocation.sample(generator), collocation.sample(generator)
+    assert torch.equal(first["state"], collocation.sample(rng())["state"])
+    assert not torch.equal(first["state"], second["state"])
+
+
+def distance_to_faces(problem, x):
+    """|level| of the nearest of the two absorbing sets, in float64."""
+    sets = [problem.avoid_level(x.double()).abs()]
+    if problem.objective == "reach-avoid":
+        sets.append(problem.target_level(x.double()).abs())
+    return torch.stack(sets).amin(0)
+
+
+@problems
+def test_faces_lie_on_faces_with_the_value_there(problem):
+    points = BoundarySampler(problem, initial=0, faces=2_000).sample(rng())
+    tau, x, value = points["tau"][:, 0], points["state"], points["value"]
+    assert (tau > 0).all()
+    assert (tau <= problem.horizon).all()
+    assert distance_to_faces(problem, x).max() < 1e-6
+    if problem.objective == "invariance":
+        assert (value == 0).all()
+        return
+    on_target = problem.target_level(x.double()).abs() < 1e-6
+    assert (value[on_target] == 1).all()
+    assert on_target.any()
+    if problem.has_avoid_set:
+        assert (value[~on_target] == 0).all()
+        assert 0.4 < value.mean() < 0.6
+
+
+def test_every_face_of_a_square_is_found():
+    x = BoundarySampler(Corner(), initial=0, faces=2_000).sample(rng())["state"]
+    for level in ((x - 0.5).abs(), (x + 0.5).abs()):
+        assert ((level < 1e-6).float().mean(0) > 0.1).all()
+
+
+@problems
+def test_initial_points_are_outside_both_sets_at_tau_zero(problem):
+    points = BoundarySampler(problem, initial=500, faces=0).sample(rng())
+    assert (points["tau"] == 0).all()
+    assert problem.interior(points["state"]).all()
+    assert torch.equal(points["value"], torch.full((500,), float(problem.objective == "invariance")))
+
+
+def test_sizes_add_up_and_draws_differ():
+    sampler, generator = BoundarySampler(Safety1D(), initial=30, faces=50), rng()
+    first, second = sampler.sample(generator), sampler.sample(generator)
+    assert (len(first), int((first["tau"] == 0).sum())) == (80, 30)
+    assert not torch.equal(first["state"], second["state"])
+    assert torch.equal(first["state"], sampler.sample(rng())["state"])
+
+
+class Needle(Reach1D):
+    """A target too thin for sampling."""
+
+    def target_level(self, x):
+        return (x[..., 0] - 1).abs() - 1e-9
+
+
+class MarkedNeedle(Needle):
+    def faces(self, count, generator=None):
+        return torch.ones(count, 1, dtype=torch.float64), torch.ones(count, dtype=torch.float64)
+
+
+def test_a_set_too_thin_to_be_found_is_named_and_its_own_faces_are_taken():
+    with pytest.raises(ProblemError, match=r"Needle: neither target nor avoid set found .* give faces"):
+        BoundarySampler(Needle())
+    points = BoundarySampler(MarkedNeedle(), initial=0, faces=10).sample(rng())
+    assert torch.equal(points["state"], torch.ones(10, 1))
+    assert torch.equal(points["value"], torch.ones(10))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Collocation(Reach1D(), sampler="grid"), "collocation.sampler: .* got 'grid'"),
+        (lambda: Collocation(Reach1D(), size=0), "size >= 1"),
+        (lambda: Collocation(Reach1D(), widen=0.0), "widen > 0"),
+        (lambda: BoundarySampler(Reach1D(), 0, 0), "boundary: .* got 0 and 0"),
+        (lambda: BoundarySampler(Reach1D(), -1, 5), "boundary: .* got -1 and 5"),
+    ],
+)
+def test_errors_name_the_key(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_expanded_box_of_the_sampler():
+    assert Collocation(Reach1D(), widen=1.5).box == Box([-3.0], [3.0])

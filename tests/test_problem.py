@@ -1,0 +1,210 @@
+"""The problem: its checks, what its sets say together, and the shipped problems' own facts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from oracles import PROBLEMS, SHIPPED, Corner, name
+from torch import Tensor
+
+from pirl_rl.operators import generator
+from pirl_rl.payoffs import LipschitzPayoff
+from pirl_rl.problem import ProblemError, ReachAvoidProblem, check_problem
+from pirl_rl.problems import Reach1D, Safety1D
+from pirl_rl.sets import Box
+
+GOLDEN = np.load(Path(__file__).parent / "data" / "reach1d_value.npz")
+
+
+def sample(problem: ReachAvoidProblem, count: int = 2_000) -> Tensor:
+    return problem.states.expand(1.5).sample(count, torch.Generator().manual_seed(0), torch.float64)
+
+
+@pytest.mark.parametrize("problem", PROBLEMS, ids=name)
+def test_problems_do_not_contradict_themselves(problem):
+    check_problem(problem)
+
+
+@pytest.mark.parametrize("problem", [*PROBLEMS, Corner()], ids=name)
+def test_sets_and_boundary_values_agree(problem):
+    x = sample(problem)
+    reached, failed, interior = problem.reached(x), problem.failed(x), problem.interior(x)
+    assert torch.equal(interior, ~reached & ~failed)
+    assert interior.any()
+    assert not (reached & failed).any()
+    value = problem.boundary_value(x)
+    assert (value[failed] == 0).all()
+    if problem.objective == "invariance":
+        assert not reached.any()
+        assert (value[~failed] == 1).all()
+    else:
+        assert reached.any()
+        assert (value[reached] == 1).all()
+        assert (value[interior] == 0).all()
+        assert torch.equal(reached, (problem.target_constraints(x) <= 0).all(-1))
+        assert torch.equal(reached, problem.target_level(x) <= 0)
+
+
+@pytest.mark.parametrize("problem", PROBLEMS, ids=name)
+def test_physics_broadcasts_and_keeps_its_dtype(problem):
+    """One row at a time equals the batch, and float32 stays float32."""
+    x, u = sample(problem, 6), problem.controls.sample(6, torch.Generator().manual_seed(1), torch.float64)
+    for term in (problem.drift, problem.diffusion):
+        whole = term(x, u)
+        for index in range(6):
+            torch.testing.assert_close(term(x[index], u[index]), whole[index], rtol=1e-14, atol=1e-14)
+        torch.testing.assert_close(term(x.view(2, 3, -1), u.view(2, 3, -1)).flatten(0, 1), whole)
+        assert term(x.float(), u.float()).dtype == torch.float32
+
+
+@pytest.mark.parametrize("problem", SHIPPED, ids=name)
+def test_an_optimal_control_is_admissible(problem):
+    x = sample(problem)
+    u = problem.optimal_control(torch.ones(len(x), dtype=x.dtype), x)
+    if u is None:
+        pytest.skip("no optimal control is known")
+    assert problem.controls.contains(u).all()
+
+
+@pytest.mark.parametrize(
+    "problem", [p for p in SHIPPED if p.exact_value(torch.ones(1), torch.zeros(1, 1)) is not None], ids=name
+)
+def test_an_exact_value_solves_the_hjb_equation(problem):
+    """Residual zero at the optimal control and not positive at any other; boundary values where they are given."""
+    x = sample(problem)
+    x = x[problem.interior(x) & (problem.target_level(x) > 0.05)]
+    tau = problem.horizon * (
+        0.05 + 0.95 * torch.rand(len(x), generator=torch.Generator().manual_seed(2), dtype=x.dtype)
+    )
+    best = generator(problem.exact_value, problem, tau, x, problem.optimal_control(tau, x))
+    assert best.abs().max() <= 1e-10
+    u = problem.controls.sample(len(x), torch.Generator().manual_seed(3), x.dtype)
+    assert (generator(problem.exact_value, problem, tau, x, u) <= 1e-10).all()
+    everywhere = sample(problem)
+    torch.testing.assert_close(
+        problem.exact_value(torch.zeros(len(everywhere), dtype=x.dtype), everywhere), problem.boundary_value(everywhere)
+    )
+    absorbed = everywhere[~problem.interior(everywhere)]
+    torch.testing.assert_close(
+        problem.exact_value(torch.ones(len(absorbed), dtype=x.dtype), absorbed), problem.boundary_value(absorbed)
+    )
+
+
+def test_value_of_reach1d():
+    """Against an independent table: tau in [0, 2] x x in [-2, 2], tau = 0 and the corner included."""
+    tau, x = np.meshgrid(GOLDEN["tau"], GOLDEN["x"], indexing="ij")
+    value = Reach1D().exact_value(torch.tensor(tau), torch.tensor(x).unsqueeze(-1))
+    np.testing.assert_allclose(value.numpy(), GOLDEN["value"], rtol=0, atol=1e-12)
+
+
+def test_value_of_reach1d_far_away_neither_overflows_nor_loses_its_gradient():
+    tau, x = torch.tensor([1e-6, 2.0, 0.0, 2.0]), torch.tensor([[-60.0], [-60.0], [1.0], [3.0]], requires_grad=True)
+    value = Reach1D().exact_value(tau, x)
+    assert torch.equal(value.detach(), torch.tensor([0.0, 0.0, 0.0, 1.0]))
+    (gradient,) = torch.autograd.grad(value.sum(), x)
+    assert gradient.isfinite().all()
+
+
+def test_default_avoid_set_is_empty():
+    x = sample(Reach1D())
+    assert not Reach1D().failed(x).any()
+    assert not Reach1D().has_avoid_set
+    assert Safety1D().has_avoid_set
+    assert torch.equal(Safety1D().failed(x), x[:, 0].abs() >= 1)
+
+
+def test_constructor_arguments_change_this_problem_alone():
+    problem = Reach1D(payoff=LipschitzPayoff(0.3), horizon=1)
+    assert (problem.payoff, problem.horizon) == (LipschitzPayoff(0.3), 1.0)
+    assert (Reach1D().payoff.epsilon, Reach1D().horizon) == (0.0, 2.0)
+
+
+# Problems that contradict themselves
+
+
+class NoHorizon(ReachAvoidProblem):
+    states, controls = Box([-2.0], [2.0]), Box([-1.0], [1.0])
+    drift, diffusion, target_level = Reach1D.drift, Reach1D.diffusion, Reach1D.target_level
+
+
+class NoTarget(ReachAvoidProblem):
+    horizon, states, controls = 1.0, Box([-2.0], [2.0]), Box([-1.0], [1.0])
+    drift, diffusion = Reach1D.drift, Reach1D.diffusion
+
+
+class Backwards(Reach1D):
+    horizon = -1.0
+
+
+class ScalarDrift(Reach1D):
+    def drift(self, x, u):
+        return u[..., 0]
+
+
+class FlatDiffusion(Reach1D):
+    def diffusion(self, x, u):
+        return torch.ones_like(x)
+
+
+class WideDiffusion(Reach1D):
+    def diffusion(self, x, u):
+        return x.new_ones(*x.shape[:-1], 2, 3)
+
+
+class ColumnTarget(Reach1D):
+    def target_level(self, x):
+        return 2 - x
+
+
+class ColumnAvoid(Reach1D):
+    def avoid_level(self, x):
+        return x + 3
+
+
+@pytest.mark.parametrize(
+    ("problem", "message"),
+    [
+        (NoHorizon, "NoHorizon has no horizon"),
+        (Backwards, "Backwards: horizon must be positive, got -1.0"),
+        (ScalarDrift, r"ScalarDrift.drift: expected shape \(16, 1\) for 16 states, got \(16,\)"),
+        (FlatDiffusion, r"FlatDiffusion.diffusion: expected shape \(\*, 1, w\), got \(16, 1\)"),
+        (WideDiffusion, r"WideDiffusion.diffusion: expected shape \(16, 1, 3\) for 16 states, got \(16, 2, 3\)"),
+        (ColumnTarget, r"ColumnTarget.target_level: expected shape \(16,\) for 16 states, got \(16, 1\)"),
+        (ColumnAvoid, r"ColumnAvoid.avoid_level: expected shape \(16,\) for 16 states, got \(16, 1\)"),
+    ],
+)
+def test_a_wrong_part_is_named(problem, message):
+    with pytest.raises(ProblemError, match=message):
+        check_problem(problem())
+
+
+def test_a_missing_target_is_named():
+    with pytest.raises(NotImplementedError, match=r"NoTarget needs target_level\(x\)"):
+        check_problem(NoTarget())
+
+
+def test_a_missing_drift_is_named():
+    class Incomplete(ReachAvoidProblem):
+        diffusion, target_level = Reach1D.diffusion, Reach1D.target_level
+
+    with pytest.raises(TypeError, match="drift"):
+        Incomplete()
+
+
+@pytest.mark.parametrize("width", [0.5, 0.005])
+def test_overlap_is_found_and_one_point_of_it_named(width):
+    """Sets that share a sliver of the box, found on at least 100,000 points."""
+
+    class Overlap(Reach1D):
+        def avoid_level(self, x):
+            return (x[..., 0] - 2).abs() - width
+
+    with pytest.raises(
+        ProblemError, match=r"target and avoid set overlap.* of 1\d{5} sampled points.*x = \["
+    ) as caught:
+        check_problem(Overlap())
+    point = float(str(caught.value).split("x = [")[1].rstrip("]"))
+    assert 2 <= point <= 2 + width

@@ -1,0 +1,321 @@
+"""The command line: what is trained, what is refused, what is left behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+from small import QUICK, command
+
+from pirl_rl import __main__, load_run, train
+from pirl_rl.configuration import CONF, CONFIG, load_config
+
+OWN = """
+import torch
+from pirl_rl import Box, ReachAvoidProblem
+
+class MyProblem(ReachAvoidProblem):
+    horizon = 1.0
+    states, controls = Box([-2.0, -1.0], [2.0, 1.0]), Box([-1.0], [1.0])
+    def drift(self, x, u):
+        return torch.cat([x[..., 1:], u], -1)
+    def diffusion(self, x, u):
+        return torch.stack([torch.zeros_like(x), torch.ones_like(x)], -1)[..., 1:]
+    def target_level(self, x):
+        return 1 - x[..., 0]
+    def avoid_level(self, x):
+        return x[..., 0] + OFFSET
+"""
+SMALL = ("env.num_envs=32", "collector.frames_per_batch=64", "collector.warmup_frames=64")
+
+
+def names(group: str) -> list[str]:
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+@pytest.fixture
+def cli(tmp_path, monkeypatch, capfd):
+    """Runs the command in this process, from an empty directory: (exit code, what it printed)."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: str) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["train", *arguments])
+        code = 0
+        try:
+            train.main()
+        except SystemExit as stop:
+            code = stop.code
+        printed = capfd.readouterr()
+        return code, printed.out + printed.err
+
+    return call
+
+
+def only_run(folder: Path) -> Path:
+    [run] = folder.glob("runs/*/*")
+    return run
+
+
+@pytest.mark.parametrize("experiment", names("experiment"))
+def test_every_experiment_trains(experiment, cli, tmp_path, monkeypatch):
+    own = []
+    if experiment == "own":
+        (tmp_path / "my_module.py").write_text(OWN.replace("OFFSET", "1.5"))
+        monkeypatch.syspath_prepend(tmp_path)
+        own = ["env.problem._target_=my_module.MyProblem"]
+    code, text = cli(f"+experiment={experiment}", "+debug=default", *SMALL, *own)
+    assert code == 0, text
+    run = only_run(tmp_path)
+    summary = json.loads((run / "summary.json").read_text())
+    assert summary["updates"] == 20
+    assert {"success_rate", "reward", "hjb_sup_loss", "td_loss", "boundary_loss", "calibration_mse"} <= summary.keys()
+    assert (run / "figures" / "training.png").is_file()
+    opened = load_run(run, trust=("my_module",))
+    assert opened.update == 20
+    sys.modules.pop("my_module", None)
+
+
+@pytest.mark.parametrize(
+    "setting", [f"{group}={name}" for group in ("method", "schedule", "logger") for name in names(group)]
+)
+def test_every_choice_trains(setting, cli, tmp_path, monkeypatch):
+    monkeypatch.setenv("WANDB_API_KEY", "")
+    monkeypatch.setenv("NETRC", str(tmp_path / "absent"))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.delenv("WANDB_CACHE_DIR", raising=False)
+    code, text = cli(*QUICK, *SMALL, setting)
+    assert code == 0, text
+    run = only_run(tmp_path)
+    assert (run / "metrics.csv").exists() == (setting != "logger=none")
+    assert not (tmp_path / ".cache" / "wandb").exists()
+    if setting == "logger=wandb":
+        assert list(run.glob("wandb/offline-run-*/*.wandb"))
+    if setting == "logger=tensorboard":
+        assert list(run.glob("tensorboard/events*"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["trainer.updats=3"], "updats"),
+        (["+trainer.updats=3"], "trainer.updats"),
+        (["trainer.updates=many"], "trainer.updates: expected int, got 'many'"),
+        (["trainer.updates=-3"], "trainer.updates: expected an integer >= 1, got -3"),
+        (["env.dt=5"], "dt: expected 0 < dt <= horizon = 2.0, got 5.0"),
+        (["seed=x"], "seed: expected int, got 'x'"),
+        (["seed=-1"], "seed"),
+        (["critics=0"], "critics"),
+        (["device=cuda"], "device"),
+        (["device=tpu"], "device: expected auto, cpu or cuda"),
+        (["compile=maybe"], "learner.compile: expected bool"),
+        (["logger._target_=os.system"], "logger._target_"),
+        (["loss=td3"], "loss: expected settings with a _target_, got 'td3'"),
+        (["critic.activation=Tnah"], "Tnah"),
+        (["evaluation.final=[exact,nope]"], "evaluation.final"),
+        (["method=nope"], "nope"),
+        (["collector=nope"], "nope"),
+        (["env.problem._target_=nope.Problem"], "nope"),
+        (["env.problem._target_=pirl_rl.problems.Nope"], "Nope"),
+        (["env.num_envs=0"], "num_envs"),
+        (["hydra.run.dir=."], "not empty"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_mistakes_are_named_and_leave_nothing(arguments, told, cli, tmp_path):
+    (tmp_path / "mine").touch()
+    if "device=cuda" in arguments and torch.cuda.is_available():
+        pytest.skip("there is a CUDA device")
+    code, text = cli(*QUICK, *arguments)
+    assert code == 1
+    assert told in text
+    assert "Traceback" not in text
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["+experiment=nope"], "nope"),
+        (["+experiment=own"], "env.problem._target_: a value is missing"),
+        (["resume=nope"], "nope is not a run directory"),
+        (["resume=."], ". is not a run directory"),
+        (["+experiment=own", "env.problem._target_=overlapping.MyProblem"], "overlap"),
+    ],
+    ids=lambda value: value[-1] if isinstance(value, list) else "",
+)
+def test_mistakes_of_whole_runs(arguments, told, cli, tmp_path, monkeypatch):
+    (tmp_path / "overlapping.py").write_text(OWN.replace("OFFSET", "-1.5"))
+    monkeypatch.syspath_prepend(tmp_path)
+    code, text = cli(*arguments)
+    sys.modules.pop("overlapping", None)
+    assert code == 1
+    assert told in text
+    assert "x = [" in text or told != "overlap"
+    assert "Traceback" not in text
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("finished")
+    done = command(*QUICK, *SMALL, "learner.decay=constant", "trainer.updates=10", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    return only_run(folder)
+
+
+def test_resume_with_more_updates(finished, cli, tmp_path):
+    code, text = cli(f"resume={finished}", "trainer.updates=14")
+    assert code == 0, text
+    assert load_config(finished).trainer.updates == 14
+    assert json.loads((finished / "summary.json").read_text())["updates"] == 14
+    assert load_run(finished).update == 14
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("override", "told"),
+    [
+        ("trainer.updates=2", "trainer.updates"),
+        ("trainer.updats=20", "updats"),
+        ("logger=none", "single settings only"),
+        ("+seed=1", "single settings only"),
+        ("-m", "-m"),
+        ("trainer.updates=[", "["),
+        ("critic.hidden=[8]", "does not fit"),
+    ],
+)
+def test_resume_refuses(override, told, finished, cli):
+    before = {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()}
+    code, text = cli(f"resume={finished}", override)
+    assert code == 1
+    assert told in text
+    assert "Traceback" not in text
+    assert before == {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()}
+
+
+def test_resume_writes_nowhere_else(finished, cli, tmp_path):
+    precious = tmp_path / "precious"
+    precious.write_text("mine")
+    link = finished / "figures" / "extra.png"
+    link.symlink_to(precious)
+    code, text = cli(f"resume={finished}")
+    link.unlink()
+    assert (code, precious.read_text()) == (1, "mine")
+    assert "leads out of the run directory" in text
+
+
+def test_resume_ignores_what_the_directory_trusts(finished, cli):
+    path, before = finished / CONFIG, (finished / CONFIG).read_text()
+    hostile = OmegaConf.create(before)
+    hostile.trust = ["os"]
+    hostile.logger = {"_target_": "os.system", "command": "touch ran"}
+    path.write_text(OmegaConf.to_yaml(hostile))
+    code, text = cli(f"resume={finished}")
+    path.write_text(before)
+    assert code == 1
+    assert "os.system is outside pirl_rl" in text
+    assert not Path("ran").exists()
+
+
+def test_a_run_is_never_overwritten(finished, cli):
+    before = (finished / CONFIG).read_bytes()
+    code, text = cli(*QUICK, "seed=5", f"hydra.run.dir={finished}")
+    assert code == 1
+    assert "never overwrites" in text
+    assert (finished / CONFIG).read_bytes() == before
+
+
+def test_sweep_goes_on_after_a_bad_job(cli, tmp_path):
+    code, text = cli("-m", *QUICK, *SMALL, "seed=0,x,2")
+    assert code == 1
+    assert "seed: expected int, got 'x'" in text
+    assert "Traceback" not in text
+    assert sorted(path.name for path in tmp_path.glob("runs/*/*/*-*")) == ["0-pirl-0", "2-pirl-2"]
+
+
+def test_bad_sweep_leaves_nothing(tmp_path):
+    done = command("-m", *QUICK, "method=nope,pirl", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "nope" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_joblib_sweep(tmp_path):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    arguments = ["-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", *QUICK, *SMALL]
+    done = command(*arguments, "seed=0,1", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert len(list(tmp_path.glob("runs/*/*/*/summary.json"))) == 2
+    done = command(*arguments, "seed=0,x", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "seed: expected int, got 'x'" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("environment", [{"PATH": "", "CXX": ""}, {"CXX": "false"}], ids=["none", "broken"])
+def test_without_a_compiler_it_warns_once_and_trains(environment, tmp_path):
+    cache = {"TORCHINDUCTOR_CACHE_DIR": str(tmp_path / "cache"), "TMPDIR": str(tmp_path)}
+    done = command(*QUICK, *SMALL, "compile=true", cwd=tmp_path, **environment, **cache)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("updates run eagerly") == 1
+    assert (only_run(tmp_path) / "summary.json").exists()
+
+
+def start(folder: Path, *arguments: str) -> subprocess.Popen:
+    """Training for ever, from its first row of metrics on."""
+    environment = {**os.environ, "PYTHONPATH": str(CONF.parent), "OMP_NUM_THREADS": "1"}
+    line = [sys.executable, "-m", "pirl_rl.train", *QUICK, *SMALL, "trainer.updates=1000000", *arguments]
+    child = subprocess.Popen(line, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True)
+    for text in child.stderr:
+        if text.startswith("update 1/"):
+            return child
+    raise AssertionError("training ended before its first update")
+
+
+@pytest.mark.parametrize("collector", ["sync", pytest.param("multi_async", marks=pytest.mark.slow)])
+def test_interrupt_saves_and_tells_how_to_go_on(collector, tmp_path):
+    child = start(tmp_path, f"collector={collector}", *SMALL[1:])
+    child.send_signal(signal.SIGINT)
+    text = child.communicate(timeout=60)[1]
+    assert child.returncode == 130
+    assert "go on with: python -m pirl_rl.train resume=" in text
+    assert "Traceback" not in text
+    run = only_run(tmp_path)
+    assert load_run(run).update >= 1
+    done = command(f"resume={run}", f"trainer.updates={load_run(run).update + 1}", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_installed_wheel_in_an_empty_directory(tmp_path):
+    root, wheels, site = CONF.parent, tmp_path / "wheels", tmp_path / "site"
+    pip = [sys.executable, "-m", "pip", "-q"]
+    subprocess.run([*pip, "wheel", "--no-deps", "-w", str(wheels), str(root)], check=True)
+    subprocess.run([*pip, "install", "--no-deps", "--target", str(site), *map(str, wheels.glob("*.whl"))], check=True)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    environment = {**os.environ, "PYTHONPATH": str(site), "OMP_NUM_THREADS": "1"}
+    for arguments in (["pirl_rl"], ["pirl_rl.train", *QUICK, *SMALL]):
+        line = [sys.executable, "-m", *arguments]
+        done = subprocess.run(line, cwd=empty, env=environment, capture_output=True, text=True, timeout=200)
+        assert done.returncode == 0, done.stderr
+    assert (site / "pirl_rl" / "conf" / "train.yaml").is_file()
+    assert (only_run(empty) / "summary.json").is_file()
+
+
+def test_catalogue_lists_what_there_is():
+    text = __main__.catalogue()
+    for group in __main__.GROUPS:
+        for name in names(group):
+            [line] = [line for line in text.splitlines() if line.split()[:1] == [name]]
+            assert len(line.split()) > 2, f"conf/{group}/{name}.yaml needs a comment that says what it is"
+    assert "Reach1D" in text
