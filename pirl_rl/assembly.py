@@ -84,7 +84,7 @@ def make_trainer(config: DictConfig, folder: Path | None = None, trust: Sequence
 
 def _evaluators(config: DictConfig, when: str, trust: Sequence[str]) -> list[Evaluator]:
     names = config[when]
-    known = [name for name in config if isinstance(config[name], DictConfig)]
+    known = [str(name) for name in config if isinstance(config[name], DictConfig)]
     if not isinstance(names, ListConfig) or not all(name in known for name in names):
         raise ConfigError(f"evaluation.{when}: expected a list of names out of {', '.join(known)}, got {names}")
     return [build(config[name], f"evaluation.{name}", trust) for name in names]

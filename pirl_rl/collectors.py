@@ -80,8 +80,8 @@ class Exploration(nn.Module):
 def exploring_policy(actor: Actor, exploration: Exploration) -> TensorDictSequential:
     """The actor with noise."""
     return TensorDictSequential(
-        TensorDictModule(actor, in_keys=["tau", "state"], out_keys=["action"]),
-        TensorDictModule(exploration, in_keys=["action", "is_init"], out_keys=["action"]),
+        TensorDictModule(actor, in_keys=["tau", "state"], out_keys=["action"]),  # type: ignore[arg-type]
+        TensorDictModule(exploration, in_keys=["action", "is_init"], out_keys=["action"]),  # type: ignore[arg-type]
     )
 
 
@@ -176,7 +176,7 @@ class SyncCollector:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         _load_buffer(self.buffer, self._rng, state["buffer"])
         # TorchRL saves no environment state; the carried TensorDict is all that a ReachAvoidEnv has.
-        self._collector.load_state_dict({**self._collector.state_dict(), "frames": state["frames"]})
+        self._collector.load_state_dict({**self._collector.state_dict(), "frames": state["frames"]})  # type: ignore[arg-type]
         self._collector._carrier.update(TensorDict(state["carrier"], device=self.env.device))
         self.env.rng.set_state(state["env_rng"])
 
@@ -222,8 +222,9 @@ class MultiAsyncCollector:
         self._envs = [partial(_worker_env, recipe, os.getpid()) for recipe in recipes]
         self._policy = exploring_policy(self._copy, Exploration(exploration_noise, exploration))
         self._frames_per_batch, self._transitions = frames_per_batch, Transitions(n_steps)
-        self._collector: torchrl_collectors.MultiAsyncCollector | None = None
-        weakref.finalize(self, shutil.rmtree, self.buffer.storage.scratch_dir, ignore_errors=True)
+        self._collector: Any = None
+        storage: Any = self.buffer.storage
+        weakref.finalize(self, shutil.rmtree, storage.scratch_dir, ignore_errors=True)
         self._delivered, self._delivered_at = 0, 0.0
 
     def start(self) -> None:
@@ -237,7 +238,7 @@ class MultiAsyncCollector:
                 replay_buffer=self.buffer,
                 postproc=self._transitions,
                 auto_register_policy_transforms=False,
-                weight_sync_schemes={"policy": SharedMemWeightSyncScheme(sync=False)},
+                weight_sync_schemes={"policy": SharedMemWeightSyncScheme(sync=False)},  # type: ignore[call-arg]
             )
         except RuntimeError as error:
             raise CollectorError(f"rollout workers did not start, see their messages above: {error}") from None
@@ -330,6 +331,6 @@ def _load_buffer(buffer: TensorDictReplayBuffer, rng: torch.Generator, state: di
     """Refill an empty buffer: unlike TorchRL's own, this keeps the storage on its device and in shared memory."""
     if state["transitions"]:
         transitions = TensorDict(state["transitions"]).auto_batch_size_(1)
-        buffer.extend(transitions.to(buffer.storage.device))
+        buffer.extend(transitions.to(rng.device))
     buffer.writer.load_state_dict(state["writer"])
     rng.set_state(state["rng"])

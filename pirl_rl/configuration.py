@@ -51,7 +51,7 @@ def build(node: Any, key: str, trust: Sequence[str] = (), **extra: Any) -> Any:
     """
     if not isinstance(node, DictConfig) or "_target_" not in node:
         raise ConfigError(f"{key}: expected settings with a _target_, got {node!r}")
-    values = {name: _value(node, name, f"{key}.{name}", trust) for name in node}
+    values = {str(name): _value(node, name, f"{key}.{name}", trust) for name in node}
     constructor = resolve(str(values.pop("_target_")), f"{key}._target_", trust)
     values = _checked(constructor, values, key, extra)
     try:

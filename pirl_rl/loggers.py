@@ -76,17 +76,18 @@ class TorchRLLogger(CSVLogger):
     """
 
     def __init__(self, kind: Literal["wandb", "tensorboard"], project: str = "pirl_rl"):
-        self.kind, self.project = kind, project
+        self.kind: Literal["wandb", "tensorboard"] = kind
+        self.project = project
 
     def open(self, folder: Path, config: Mapping[str, Any]) -> None:
         super().open(folder, config)
-        name, extra = self.kind, {}
+        name, extra = str(self.kind), dict[str, Any]()
         if self.kind == "wandb":
             name = folder.name
             os.environ.setdefault("WANDB_CACHE_DIR", str(folder / "wandb" / "cache"))
             offline = "WANDB_MODE" not in os.environ and not _has_wandb_account()
             extra = {"wandb_kwargs": {"project": self.project, "offline": offline, "config": dict(config)}}
-        self.logger = get_logger(self.kind, logger_name=str(folder), experiment_name=name, **extra)
+        self.logger: Any = get_logger(self.kind, logger_name=str(folder), experiment_name=name, **extra)
 
     def log(self, row: Mapping[str, float]) -> None:
         super().log(row)

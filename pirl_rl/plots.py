@@ -13,6 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from pirl_rl.solution import Solution
@@ -28,6 +29,8 @@ HELD_OUT = {
 WEIGHTS = {"td_weight": "TD", "hjb_weight": "HJB", "boundary_weight": "boundary"}
 STYLES = {"TD": "C0-", "HJB": "C1-", "boundary": "C2--", "HJB, sup over u": "C3--", "MSE of V": "C4-"}
 DPI = 150
+ERRORS = (1e-4, 1.0)
+"""Colour scale of absolute errors, logarithmic: the corner would else hide all others."""
 
 
 class Grid(NamedTuple):
@@ -69,8 +72,8 @@ def read_metrics(path: str | Path) -> dict[str, np.ndarray]:
     return {name: np.array([float(row[name] or "nan") for row in cells]) for name in names}
 
 
-def solve_on_grid(solution: Solution, taus: int = 201, states: int = 201) -> Grid:
-    """The raw value and the policy on [0, T] x `problem.states`."""
+def solve_on_grid(solution: Solution, taus: int = 101, states: int = 201) -> Grid:
+    """The raw value and the policy on [0, T] x `problem.states`: the paper's error grid."""
     problem = solution.problem
     tau = torch.linspace(0, problem.horizon, taus, dtype=torch.float64)
     x = torch.linspace(problem.states.low[0], problem.states.high[0], states, dtype=torch.float64)
@@ -103,17 +106,18 @@ def draw_surface(grid: Grid) -> Figure:
 
 def draw_value(grid: Grid) -> Figure:
     """Heat maps of the learned V and, where it is known, of the exact V and of the error."""
-    maps = [("Learned V", grid.value, 1.0, "viridis")]
+    unit = Normalize(0, 1)
+    maps: list[tuple[str, np.ndarray, Normalize, str]] = [("Learned V", grid.value, unit, "viridis")]
     if grid.exact is not None:
         error = np.abs(grid.value - grid.exact)
         mse = np.square(error).mean()
         maps += [
-            ("Exact V", grid.exact, 1.0, "viridis"),
-            (f"|error|, MSE {mse:.1e}", error, error.max() or 1.0, "magma"),
+            ("Exact V", grid.exact, unit, "viridis"),
+            (f"|error|, MSE {mse:.1e}", error.clip(ERRORS[0]), LogNorm(*ERRORS), "magma"),
         ]
     figure = Figure(figsize=(0.6 + 4.2 * len(maps), 3.8), layout="constrained")
-    for axes, (title, values, top, colors) in zip(figure.subplots(1, len(maps), squeeze=False)[0], maps, strict=True):
-        _heat_map(figure, axes, grid, values, (0.0, top), colors, title)
+    for axes, (title, values, scale, colors) in zip(figure.subplots(1, len(maps), squeeze=False)[0], maps, strict=True):
+        _heat_map(figure, axes, grid, values, scale, colors, title)
     return figure
 
 
@@ -123,7 +127,7 @@ def draw_policy(grid: Grid, solution: Solution) -> Figure:
     figure = Figure(figsize=(0.6 + 4.2 * controls.dim, 3.8), layout="constrained")
     for i, axes in enumerate(figure.subplots(1, controls.dim, squeeze=False)[0]):
         name = "Learned control u (SI)" if controls.dim == 1 else f"Learned control u{i + 1} (SI)"
-        _heat_map(figure, axes, grid, grid.control[i], (controls.low[i], controls.high[i]), "coolwarm", name)
+        _heat_map(figure, axes, grid, grid.control[i], Normalize(controls.low[i], controls.high[i]), "coolwarm", name)
     return figure
 
 
@@ -151,9 +155,9 @@ def log_scale(axes: Axes, axis: Literal["x", "y"], values: Sequence[float]) -> N
 
 
 def _heat_map(
-    figure: Figure, axes: Axes, grid: Grid, values: np.ndarray, limits: tuple[float, float], colors: str, title: str
+    figure: Figure, axes: Axes, grid: Grid, values: np.ndarray, scale: Normalize, colors: str, title: str
 ) -> None:
-    mesh = axes.pcolormesh(grid.tau, grid.x, values, cmap=colors, vmin=limits[0], vmax=limits[1], shading="gouraud")
+    mesh = axes.pcolormesh(grid.tau, grid.x, values, cmap=colors, norm=scale, shading="gouraud")
     axes.set(title=title, xlabel="time to go τ (s)", ylabel="state x (SI)")
     figure.colorbar(mesh, ax=axes)
 

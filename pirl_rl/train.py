@@ -12,7 +12,7 @@ from pathlib import Path
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import CompactHydraException, HydraException, OverrideParseException
+from hydra.errors import CompactHydraException, HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -100,7 +100,7 @@ def _named_modules(overrides: Sequence[str]) -> list[str]:
 def _override(config: DictConfig, text: str) -> None:
     try:
         override = OverridesParser.create().parse_override(text)
-    except OverrideParseException as error:
+    except HydraException as error:
         raise ConfigError(f"{text}: {error}") from None
     plain = "=" in text and not text.startswith(("+", "~")) and not override.is_sweep_override()
     if not plain or isinstance(OmegaConf.select(config, override.key_or_group), DictConfig):
