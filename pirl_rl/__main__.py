@@ -13,6 +13,7 @@ COMMANDS = (
     ("python -m pirl_rl.train +experiment=own env.problem._target_=my_module.MyProblem", "train on your own problem"),
     ("python -m pirl_rl.train resume=RUN_DIR", "go on with a run"),
     ("python -m pirl_rl.train +experiment=reach1d --cfg job", "show all settings"),
+    ("python -m pirl_rl.evaluate run=RUN_DIR", "evaluate a run again, with other samples or simulators if asked"),
     ("python -m pirl_rl.compare RUN_DIRS", "one table and one figure of many runs"),
 )
 GROUPS = {

@@ -73,8 +73,8 @@ def make_trainer(config: DictConfig, folder: Path | None = None, trust: Sequence
         collector=build(config.collector, "collector", trust, env=env, actor=actor, seed=sampling),
         collocation=build(config.collocation, "collocation", trust, problem=problem),
         boundary=build(config.boundary, "boundary", trust, problem=problem),
-        during=_evaluators(config.evaluation, "during", trust),
-        final=_evaluators(config.evaluation, "final", trust),
+        during=make_evaluators(config.evaluation, "during", trust),
+        final=make_evaluators(config.evaluation, "final", trust),
         logger=build(config.logger, "logger", trust),
         folder=folder,
         config=OmegaConf.to_container(config, resolve=True),
@@ -82,7 +82,7 @@ def make_trainer(config: DictConfig, folder: Path | None = None, trust: Sequence
     )
 
 
-def _evaluators(config: DictConfig, when: str, trust: Sequence[str]) -> list[Evaluator]:
+def make_evaluators(config: DictConfig, when: str, trust: Sequence[str]) -> list[Evaluator]:
     names = config[when]
     known = [str(name) for name in config if isinstance(config[name], DictConfig)]
     if not isinstance(names, ListConfig) or not all(name in known for name in names):

@@ -26,9 +26,13 @@ COLUMNS = (
     ("value_mse worst", "value_mse", np.max),
     ("reward mean", "reward", np.mean),
     ("reward min", "reward", np.min),
+    ("reward / optimal min", "reward_share", np.min),
     *((name, name, np.mean) for name in (*LOSSES, "updates", "wall_seconds")),
 )
 """Column of the table, key of summary.json, statistic over the group's runs."""
+
+
+SHARE = "reward / optimal reward, where known"
 
 
 class RunError(ValueError):
@@ -43,6 +47,10 @@ class Run(NamedTuple):
     metrics: dict[str, np.ndarray]
 
     def get(self, name: str) -> float:
+        """A number of the summary, NaN where there is none; "reward_share" is the reward as a fraction of the optimal
+        policy's, and the reward itself where that is not known: groups may start and end episodes differently."""
+        if name == "reward_share":
+            return self.get("reward") / float(self.summary.get("optimal_reward") or 1.0)
         value = self.summary.get(name)
         return math.nan if value is None else float(value)
 
@@ -100,7 +108,7 @@ def draw(groups: dict[str, list[Run]]) -> Figure:
     figure = Figure(figsize=(15, 8), layout="constrained")
     grid = figure.add_gridspec(2, 12)
     reward, mse, both = (figure.add_subplot(grid[0, 4 * i : 4 * i + 4]) for i in range(3))
-    _per_seed(reward, groups, "reward", "Reward of each seed", "reward: noise-free success")
+    _per_seed(reward, groups, "reward_share", "Reward of each seed", SHARE)
     _per_seed(mse, groups, "value_mse", "MSE of V of each seed", "MSE against the exact V")
     errors = [run.get("value_mse") for runs in groups.values() for run in runs]
     log_scale(mse, "y", errors)
@@ -132,13 +140,13 @@ def _per_seed(axes: Axes, groups: dict[str, list[Run]], name: str, title: str, y
 
 def _reward_against_mse(axes: Axes, groups: dict[str, list[Run]]) -> None:
     for label, (color, runs) in zip(groups, _colored(groups), strict=True):
-        pairs = np.array([(run.get("value_mse"), run.get("reward")) for run in runs])
+        pairs = np.array([(run.get("value_mse"), run.get("reward_share")) for run in runs])
         pairs = pairs[np.isfinite(pairs).all(-1)]
         axes.scatter(*pairs.T, s=14, alpha=0.6, color=color)
         # The empty scatter of a group without exact values still gives the legend its entry.
         mean = pairs.mean(0, keepdims=True) if len(pairs) else pairs
         axes.scatter(*mean.T, s=130, color=color, edgecolors="black", label=label)
-    axes.set(title="Reward against MSE, large: mean", xlabel="MSE against the exact V", ylabel="reward")
+    axes.set(title="Reward against MSE, large: mean", xlabel="MSE against the exact V", ylabel=SHARE)
     axes.grid(alpha=0.3)
 
 
@@ -168,7 +176,7 @@ def _finite(values: Sequence[float]) -> np.ndarray:
 def _number(name: str, value: float) -> str:
     if name in ("updates", "wall_seconds"):
         return f"{value:.0f}"
-    return f"{value:.4f}" if name == "reward" else f"{value:.2e}"
+    return f"{value:.4f}" if name.startswith("reward") else f"{value:.2e}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -72,16 +72,17 @@ class ReachAvoidEnv(EnvBase):
 
     def _make_specs(self) -> None:
         problem, bs, device = self.problem, self.batch_size, self.device
+        one, n, m = (torch.Size((*bs, width)) for width in (1, problem.states.dim, problem.controls.dim))
         self.observation_spec = Composite(
-            tau=Bounded(0.0, problem.horizon, (*bs, 1), device=device),
-            state=Unbounded((*bs, problem.states.dim), device=device),
-            is_init=Categorical(2, (*bs, 1), dtype=torch.bool, device=device),
+            tau=Bounded(0.0, problem.horizon, one, device=device),
+            state=Unbounded(n, device=device),
+            is_init=Categorical(2, one, dtype=torch.bool, device=device),
             shape=bs,
             device=device,
         )
-        self.action_spec = Bounded(-1.0, 1.0, (*bs, problem.controls.dim), device=device)
-        self.reward_spec = Bounded(0.0, 1.0, (*bs, 1), device=device)
-        flag = Categorical(2, (*bs, 1), dtype=torch.bool, device=device)
+        self.action_spec = Bounded(-1.0, 1.0, m, device=device)
+        self.reward_spec = Bounded(0.0, 1.0, one, device=device)
+        flag = Categorical(2, one, dtype=torch.bool, device=device)
         self.done_spec = Composite(done=flag, terminated=flag.clone(), shape=bs, device=device)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:

@@ -53,6 +53,9 @@ class PIRLLoss(TD3Loss):
     """
 
     _schedulable_buffers = frozenset(WEIGHTS)
+    td_weight: Tensor
+    hjb_weight: Tensor
+    boundary_weight: Tensor
 
     def __init__(
         self,
@@ -82,7 +85,7 @@ class PIRLLoss(TD3Loss):
             TensorDictModule(critic, in_keys=["tau", "state", "action"], out_keys=["state_action_value"])
             for critic in critics
         ]
-        own = torch.stack([TensorDict.from_module(module).data.clone() for module in modules])
+        own = torch.stack([TensorDict.from_module(module).data.clone() for module in modules])  # type: ignore[union-attr]
         super().__init__(
             TensorDictModule(actor, in_keys=["tau", "state"], out_keys=["action"]),
             # A list of one would be expanded without parameters; a module alone is re-drawn, hence the copy below.
@@ -106,10 +109,9 @@ class PIRLLoss(TD3Loss):
 
     def critic_loss(self, batch: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The weighted critic loss and its unweighted parts; each term is there if its part of the batch is."""
-        replay = batch["replay"]
         # TD3Loss draws its smoothing noise first; so do we, for the same stream.
-        noise = self._clipped_noise(replay["action"], self.policy_noise, self.noise_clip)
-        parts = {"td_loss": self._td_loss(replay, noise)}
+        noise = self._clipped_noise(batch["replay", "action"], self.policy_noise, self.noise_clip)
+        parts = {"td_loss": self._td_loss(batch["replay"], noise)}
         loss = self.td_weight * parts["td_loss"]
         if "collocation" in batch.keys():
             parts["hjb_loss"] = self._hjb_loss(batch["collocation"])
@@ -121,14 +123,14 @@ class PIRLLoss(TD3Loss):
 
     def actor_loss(self, batch: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's loss by its rule; no gradient reaches the critics."""
-        replay = batch["replay"]
-        loss = replay["tau"].new_zeros(())
+        tau, x = batch["replay", "tau"], batch["replay", "state"]
+        loss = torch.zeros((), device=tau.device)
         if self.actor_rule != "hamiltonian":
-            action = self.act(replay["tau"], replay["state"])
+            action = self.act(tau, x)
             with self.critics("frozen") as critic:
-                loss = loss - critic(replay["tau"], replay["state"], action)[0].mean()
+                loss = loss - critic(tau, x, action)[0].mean()
         if self.actor_rule != "q":
-            points = batch["collocation"] if "collocation" in batch.keys() else replay
+            points = batch["collocation"] if "collocation" in batch.keys() else batch["replay"]
             loss = loss - self._hamiltonian(points)
         return loss, {}
 
@@ -159,7 +161,7 @@ class PIRLLoss(TD3Loss):
         else:
             params = self.qvalue_network_params if kind == "online" else self.qvalue_network_params.data
         with params.to_module(self.qvalue_network, preserve_module_state=False):
-            yield self.qvalue_network.module
+            yield self.qvalue_network.module  # type: ignore[misc]
 
     def residuals(self, tau: Tensor, x: Tensor, action: Tensor, u: Tensor) -> Tensor:
         """L^u Q_i(., action) (critics, N): tau (N,), x (N, n), the critics' frozen action and the physical u (N, m)."""
@@ -168,12 +170,12 @@ class PIRLLoss(TD3Loss):
 
     def _td_loss(self, replay: TensorDictBase, noise: Tensor) -> Tensor:
         """L_TD summed over critics: (Q_i - r - (1 - d) min_j Q_j^-(y', pi^-(y') + noise))^2."""
-        following = replay["next"]
+        tau, x = replay["next", "tau"], replay["next", "state"]
         with torch.no_grad():
-            action = (self.act(following["tau"], following["state"], target=True) + noise).clamp(-1, 1)
+            action = (self.act(tau, x, target=True) + noise).clamp(-1, 1)
             with self.critics("target") as critic:
-                value = critic(following["tau"], following["state"], action).amin(0)
-            target = following["reward"] + (~following["terminated"]) * value
+                value = critic(tau, x, action).amin(0)
+            target = replay["next", "reward"] + (~replay["next", "terminated"]) * value
         with self.critics() as critic:
             value = critic(replay["tau"], replay["state"], replay["action"])
         return (value - target).square().squeeze(-1).sum(0).mean()

@@ -28,6 +28,9 @@ class Dense(nn.Linear):
 class Scaling(nn.Module):
     """The affine map of [low, high] to [-1, 1], axis by axis, as a layer: autograd does the chain rule."""
 
+    scale: Tensor
+    shift: Tensor
+
     def __init__(self, low: Sequence[float], high: Sequence[float]):
         super().__init__()
         low_, high_ = torch.as_tensor(low, dtype=torch.float64), torch.as_tensor(high, dtype=torch.float64)

@@ -118,7 +118,7 @@ class ReachAvoidProblem(ABC):
         return ~(self.reached(x) | self.failed(x))
 
     def boundary_value(self, x: Tensor) -> Tensor:
-        """V on the parabolic boundary (*, n) -> (*), Eq. (parabolic_boundary): l_eps at tau = 0 and in A_eps, 0 in B."""
+        """V on the boundary, Eq. (parabolic_boundary): l_eps at tau = 0 and in A_eps, 0 in B; (*, n) -> (*)."""
         alive = (~self.failed(x)).to(x.dtype)
         if self.objective == "invariance":
             return alive
@@ -137,7 +137,7 @@ def has_controlled_noise(problem: ReachAvoidProblem, points: int = 256, seed: in
 
 def _normalized(levels, x: Tensor) -> Tensor:
     """g/|grad g| for each of the k levels: the signed distance to the surface g = 0, to first order."""
-    value, pullback = torch.func.vjp(levels, x)
+    value, pullback = torch.func.vjp(levels, x)  # type: ignore[misc]
     gradients = torch.stack([pullback(one.expand_as(value))[0] for one in torch.eye(value.shape[-1]).to(value)], -2)
     slope = gradients.norm(dim=-1)
     return value / torch.where(slope > 0, slope, torch.ones_like(slope))

@@ -68,6 +68,16 @@ def test_law_of_tau(sampler, power):
     assert tau.mean().item() == pytest.approx(2 / (power + 1), abs=5 * deviation / 20_000**0.5)
 
 
+@pytest.mark.parametrize("power", [1.0, 2.0])
+def test_law_of_tau_on_faces(power):
+    """P(tau <= q T) = q^(1/power), within five standard errors."""
+    tau = BoundarySampler(Reach1D(), 0, 20_000, tau_power=power).sample(rng())["tau"]
+    for q in (0.04, 0.25, 0.64):
+        share = q ** (1 / power)
+        error = 5 * (share * (1 - share) / 20_000) ** 0.5
+        assert (tau <= 2 * q).double().mean().item() == pytest.approx(share, abs=error)
+
+
 @SAMPLERS
 def test_same_generator_same_points_and_no_draw_repeats(sampler):
     collocation, generator = Collocation(Reach1D(), 64, sampler), rng()
@@ -150,6 +160,8 @@ def test_a_set_too_thin_to_be_found_is_named_and_its_own_faces_are_taken():
         (lambda: Collocation(Reach1D(), sampler="grid"), "collocation.sampler: .* got 'grid'"),
         (lambda: Collocation(Reach1D(), size=0), "size >= 1"),
         (lambda: Collocation(Reach1D(), widen=0.0), "widen > 0"),
+        (lambda: Collocation(Reach1D(), tau_power=0.0), "tau_power > 0"),
+        (lambda: BoundarySampler(Reach1D(), tau_power=0.0), "tau_power > 0"),
         (lambda: BoundarySampler(Reach1D(), 0, 0), "boundary: .* got 0 and 0"),
         (lambda: BoundarySampler(Reach1D(), -1, 5), "boundary: .* got -1 and 5"),
     ],

@@ -73,6 +73,18 @@ def test_partial_reset_leaves_the_others_alone():
     assert not fresh["terminated"][chosen].any()
 
 
+def test_is_init_marks_first_states_alone():
+    env = Reach1DEnv(num_envs=256, seed=0)
+    td, ends = env.reset(), 0
+    assert td["is_init"].all()
+    for _ in range(8):
+        stepped, td = env.step_and_maybe_reset(env.rand_action(td))
+        assert not stepped["next", "is_init"].any()
+        assert torch.equal(td["is_init"], stepped["next", "done"])
+        ends += int(td["is_init"].sum())
+    assert ends > 100
+
+
 @pytest.mark.parametrize(("dt", "steps"), [(0.1, 20), (0.2, 10), (0.3, 7), (0.02, 100)])
 def test_an_episode_over_the_horizon_has_whole_steps(dt, steps):
     """In float32, far from the target: rounding neither adds nor drops one."""

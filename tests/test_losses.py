@@ -7,7 +7,7 @@ import shutil
 
 import pytest
 import torch
-from oracles import PROBLEMS, FullNoise, make_batch, name, nested_generator
+from oracles import PROBLEMS, FullNoise, make_batch, name, nested_generator, points
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives import TD3Loss
@@ -203,11 +203,12 @@ def assert_same_gradients(ours, loss, by_hand, critics):
 
 
 @pytest.mark.usefixtures("float64")
-def test_masked_points_do_not_count():
+@pytest.mark.parametrize("shift", [0.5, torch.nan])
+def test_masked_points_do_not_count(shift):
     problem = FullNoise(3, 1, 2)
     loss, batch = make_loss(problem, weights=(0.0, 1.0, 0.0), actor_rule="hamiltonian"), make_batch(problem)
     other = copy.deepcopy(batch)
-    other["collocation", "state"][~batch["collocation", "mask"]] += 0.5
+    other["collocation", "state"][~batch["collocation", "mask"]] += shift
     assert not torch.equal(other["collocation", "state"], batch["collocation", "state"])
     for term in (loss.critic_loss, loss.actor_loss):
         assert_close([term(other)[0]], [term(batch)[0]])
@@ -230,6 +231,52 @@ def test_residuals_beyond_delta_count_linearly():
     expected = torch.where(size <= delta, size**2, 2 * delta * (size - delta / 2)).sum(0).mean()
     bounded = make_loss(problem, weights=(0.0, 1.0, 0.0), hjb_delta=delta)
     assert_close([bounded.critic_loss(batch)[0]], [expected])
+
+
+@pytest.mark.usefixtures("float64")
+def test_errors_on_the_boundary_beyond_delta_count_linearly():
+    problem = FullNoise(3, 1, 2)
+    batch = make_batch(problem)
+    edge, (actor, _) = batch["boundary"], target_networks(problem)
+    action, (_, critics) = actor(edge["tau"], edge["state"]), networks(problem)
+    values = torch.stack([critic(edge["tau"], edge["state"], action)[:, 0] for critic in critics])
+    size = (values - edge["value"]).abs()
+    delta = size.median().item()
+    expected = torch.where(size <= delta, size**2, 2 * delta * (size - delta / 2)).sum(0).mean()
+    bounded = make_loss(problem, weights=(0.0, 0.0, 1.0), boundary_delta=delta)
+    assert_close([bounded.critic_loss(batch)[0]], [expected])
+
+
+# Critics
+
+
+@some_problems
+def test_a_critic_of_v_ignores_the_action(problem):
+    tau, x, action, _ = points(problem, 20)
+    v, q = (Critic(problem, (9, 7), action_input=action_input) for action_input in (False, True))
+    assert torch.equal(v(tau[:, None], x, action), v(tau[:, None], x, -action))
+    assert not torch.equal(q(tau[:, None], x, action), q(tau[:, None], x, -action))
+
+
+def test_a_sigmoid_keeps_probabilities_and_a_linear_output_does_not():
+    problem = Reach1D()
+    tau, x, action, _ = points(problem, 200)
+    linear, sigmoid = (Critic(problem, (9, 7), output=output) for output in (None, "Sigmoid"))
+    nn.init.normal_(linear.layers[-1].weight, std=2.0)
+    sigmoid.load_state_dict(linear.state_dict())
+    value = linear(tau[:, None], x, action)
+    assert value.min() < 0
+    assert value.max() > 1
+    assert torch.equal(sigmoid(tau[:, None], x, action), torch.sigmoid(value))
+
+
+@pytest.mark.parametrize("rule", ["q", "both"])
+def test_critics_of_v_refuse_an_actor_that_ascends_q(rule):
+    problem = Reach1D()
+    nets = [Critic(problem, (4,)), Critic(problem, (4,), action_input=False)]
+    with pytest.raises(ValueError, match=f"actor_rule: critics without the action need 'hamiltonian', got '{rule}'"):
+        PIRLLoss(problem, Actor(problem), nets, actor_rule=rule)
+    PIRLLoss(problem, Actor(problem), nets[1:], actor_rule="hamiltonian")
 
 
 # The actor's rules

@@ -12,7 +12,7 @@ from oracles import PROBLEMS, FullNoise, name, nested_generator, points, stack
 from torch import nn
 
 from pirl_rl.networks import Critic
-from pirl_rl.operators import ACTIVATIONS, generator, require_twice_differentiable
+from pirl_rl.operators import ACTIVATIONS, advection, generator, require_twice_differentiable
 from pirl_rl.problems import Reach1D
 
 RELATIVE = 1e-10
@@ -131,6 +131,27 @@ def test_gradient_reaches_the_control():
         generator(critic.at(action), problem, tau, x, u + sign * step).square().sum().item() for sign in (1, -1)
     )
     assert (ahead - behind) / 2 == pytest.approx((fast * step).sum().item(), rel=1e-6)
+
+
+class FreeNoise(FullNoise):
+    """A full sigma that depends on the state alone."""
+
+    def diffusion(self, x, u):
+        return super().diffusion(x, 0 * u)
+
+
+@pytest.mark.parametrize("path", ["fast", "torch.func"])
+@pytest.mark.parametrize("problem", [Reach1D(), FreeNoise(3, 2, 2)], ids=name)
+def test_advection_is_the_generator_but_for_a_term_without_the_control(problem, path):
+    critic = random_critic(problem)
+    tau, x, action, u = points(problem, 20)
+    value = critic.at(action) if path == "fast" else plain(critic, action)
+    u.requires_grad_()
+    ours, whole = (operator(value, problem, tau, x, u) for operator in (advection, generator))
+    assert distance(*(torch.autograd.grad(result.sum(), u)[0] for result in (ours, whole))) < RELATIVE
+    rest = whole - ours
+    assert rest.norm() > 0.01 * whole.norm()
+    assert distance(generator(value, problem, tau, x, -u) - advection(value, problem, tau, x, -u), rest) < RELATIVE
 
 
 @pytest.mark.parametrize("problem", PROBLEMS, ids=name)

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from oracles import PROBLEMS, SHIPPED, Corner, name
+from oracles import PROBLEMS, SHIPPED, Corner, FullNoise, name
 from torch import Tensor
 
 from pirl_rl.operators import generator
 from pirl_rl.payoffs import LipschitzPayoff
-from pirl_rl.problem import ProblemError, ReachAvoidProblem, check_problem
+from pirl_rl.problem import ProblemError, ReachAvoidProblem, check_problem, has_controlled_noise
 from pirl_rl.problems import Reach1D, Safety1D
 from pirl_rl.sets import Box
 
@@ -26,6 +26,11 @@ def sample(problem: ReachAvoidProblem, count: int = 2_000) -> Tensor:
 @pytest.mark.parametrize("problem", PROBLEMS, ids=name)
 def test_problems_do_not_contradict_themselves(problem):
     check_problem(problem)
+
+
+@pytest.mark.parametrize("problem", [*PROBLEMS, Corner()], ids=name)
+def test_controlled_noise_is_found(problem):
+    assert has_controlled_noise(problem) == isinstance(problem, FullNoise)
 
 
 @pytest.mark.parametrize("problem", [*PROBLEMS, Corner()], ids=name)

@@ -1,0 +1,38 @@
+"""Collectors: they play the current policy with exploration noise and fill the replay buffer.
+
+- `SyncCollector`: one vectorised environment in the learner's process, in step with the updates. Exactly resumable.
+- `MultiAsyncCollector`: Algorithm 1 of the paper: worker processes fill a shared buffer while the learner learns.
+  Resumes statistically: the buffer comes back, the workers' episodes start anew.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Any, Protocol
+
+from torchrl.data import TensorDictReplayBuffer
+
+from pirl_rl.collectors.multi_async import CollectorError, MultiAsyncCollector
+from pirl_rl.collectors.sync import SyncCollector
+
+__all__ = ["CollectorError", "MultiAsyncCollector", "SyncCollector", "TransitionCollector"]
+
+logging.getLogger("torchrl").setLevel(logging.WARNING)
+
+
+class TransitionCollector(Protocol):
+    """What the trainer asks of a collector; a state is loaded before `start`."""
+
+    buffer: TensorDictReplayBuffer
+
+    def start(self) -> None:
+        """Fill the buffer to its warm-up."""
+
+    def step(self, update: int) -> None:
+        """Called before each update."""
+
+    def close(self) -> None: ...
+
+    def state_dict(self) -> dict[str, Any]: ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None: ...

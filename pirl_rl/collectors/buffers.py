@@ -1,0 +1,60 @@
+"""The replay buffer of a collector: made, saved and refilled."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+from pirl_rl.envs import ReachAvoidEnv
+
+
+def check_sizes(
+    env: ReachAvoidEnv, frames_per_batch: int, updates_per_batch: int, warmup_frames: int, buffer_size: int
+) -> None:
+    envs = env.batch_size[0]
+    if frames_per_batch % envs or frames_per_batch < envs:
+        raise ValueError(
+            f"collector.frames_per_batch: expected a multiple of env.num_envs = {envs}, got {frames_per_batch}"
+        )
+    if updates_per_batch < 1 or warmup_frames < 1:
+        raise ValueError(
+            f"collector: expected updates_per_batch and warmup_frames >= 1, got {updates_per_batch} and {warmup_frames}"
+        )
+    if buffer_size < frames_per_batch:
+        raise ValueError(
+            f"collector.buffer_size: expected at least frames_per_batch = {frames_per_batch}, got {buffer_size}"
+        )
+
+
+def make_buffer(
+    size: int, device: torch.device, seed: int, shared: bool = False
+) -> tuple[TensorDictReplayBuffer, torch.Generator]:
+    """A replay buffer and the generator of its sampling."""
+    storage = LazyTensorStorage(size, device=device, shared_init=shared)
+    buffer = TensorDictReplayBuffer(storage=storage, shared=shared)
+    rng = torch.Generator(device).manual_seed(seed)
+    if not shared:
+        buffer.set_rng(rng)
+    return buffer, rng
+
+
+def buffer_state(buffer: TensorDictReplayBuffer, rng: torch.Generator) -> dict[str, Any]:
+    # Plain tensors: a memory-mapped one is a class of its own, which a checkpoint does not hold.
+    plain = buffer[:].apply(lambda entry: entry.as_subclass(torch.Tensor)) if len(buffer) else TensorDict()
+    return {
+        "transitions": plain.to_dict(),
+        "writer": buffer.writer.state_dict(),
+        "rng": rng.get_state(),
+    }
+
+
+def load_buffer(buffer: TensorDictReplayBuffer, rng: torch.Generator, state: dict[str, Any]) -> None:
+    """Refill an empty buffer: unlike TorchRL's own, this keeps the storage on its device and in shared memory."""
+    if state["transitions"]:
+        transitions = TensorDict(state["transitions"]).auto_batch_size_(1)
+        buffer.extend(transitions.to(rng.device))
+    buffer.writer.load_state_dict(state["writer"])
+    rng.set_state(state["rng"])

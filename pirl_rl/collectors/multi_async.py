@@ -1,0 +1,129 @@
+"""Worker processes that play while the learner learns."""
+
+from __future__ import annotations
+
+import copy
+import os
+import shutil
+import signal
+import time
+import weakref
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Literal
+
+import torch
+from torchrl import collectors as torchrl_collectors
+from torchrl.weight_update import SharedMemWeightSyncScheme
+
+from pirl_rl.collectors.buffers import buffer_state, check_sizes, load_buffer, make_buffer
+from pirl_rl.collectors.transitions import Exploration, Transitions, exploring_policy
+from pirl_rl.envs import ReachAvoidEnv
+from pirl_rl.networks import Actor
+
+
+class CollectorError(RuntimeError):
+    """A worker died or delivered nothing; the message names it."""
+
+
+class MultiAsyncCollector:
+    """Worker processes fill a shared buffer while the learner learns; they play on the CPU.
+
+    Args:
+        env: its `recipe` is rebuilt in each worker, with seeds of its own.
+        actor: copied to the workers every `updates_per_batch` updates.
+        workers: processes.
+        frames_per_batch: transitions a worker delivers at once, a multiple of the environment's batch size.
+        updates_per_batch: updates between two copies.
+        warmup_frames, buffer_size, exploration_noise, exploration, n_steps, seed: as for `SyncCollector`.
+        patience: seconds without a transition until `CollectorError`; a dead worker is noticed at once.
+    """
+
+    def __init__(
+        self,
+        env: ReachAvoidEnv,
+        actor: Actor,
+        workers: int = 2,
+        frames_per_batch: int = 256,
+        updates_per_batch: int = 32,
+        warmup_frames: int = 4_096,
+        buffer_size: int = 50_000,
+        exploration_noise: float = 0.2,
+        exploration: Literal["always", "start"] = "always",
+        n_steps: int = 1,
+        seed: int = 0,
+        patience: float = 60.0,
+    ):
+        check_sizes(env, frames_per_batch, updates_per_batch, warmup_frames, buffer_size)
+        if workers < 1:
+            raise ValueError(f"collector.workers: expected at least 1, got {workers}")
+        self.updates_per_batch, self.warmup_frames, self.patience = updates_per_batch, warmup_frames, patience
+        self.buffer, self._rng = make_buffer(buffer_size, torch.device("cpu"), seed, shared=True)
+        self._actor, self._copy, self._seed = actor, copy.deepcopy(actor).cpu(), seed
+        recipes = [env.recipe(seed=seed + 1 + index) for index in range(workers)]
+        self._envs = [partial(_worker_env, recipe, os.getpid()) for recipe in recipes]
+        self._policy = exploring_policy(self._copy, Exploration(exploration_noise, exploration))
+        self._frames_per_batch, self._transitions = frames_per_batch, Transitions(n_steps)
+        self._collector: Any = None
+        storage: Any = self.buffer.storage
+        weakref.finalize(self, shutil.rmtree, storage.scratch_dir, ignore_errors=True)
+        self._delivered, self._delivered_at = 0, 0.0
+
+    def start(self) -> None:
+        try:
+            self._collector = torchrl_collectors.MultiAsyncCollector(
+                self._envs,
+                self._policy,
+                frames_per_batch=self._frames_per_batch,
+                total_frames=-1,
+                init_random_frames=max(0, self.warmup_frames - self.buffer.write_count),
+                replay_buffer=self.buffer,
+                postproc=self._transitions,
+                auto_register_policy_transforms=False,
+                weight_sync_schemes={"policy": SharedMemWeightSyncScheme(sync=False)},  # type: ignore[call-arg]
+            )
+        except RuntimeError as error:
+            raise CollectorError(f"rollout workers did not start, see their messages above: {error}") from None
+        # Only now: a generator's state does not survive the way into a spawned process.
+        self.buffer.set_rng(self._rng)
+        self._collector.set_seed(self._seed)
+        self._collector.start()
+        self._delivered_at = time.monotonic()
+        while self.buffer.write_count < self.warmup_frames:
+            self._check_workers()
+            time.sleep(0.02)
+
+    def step(self, update: int) -> None:
+        self._check_workers()
+        if update % self.updates_per_batch == 0:
+            self._copy.load_state_dict(self._actor.state_dict())
+            self._collector.update_policy_weights_(self._policy)
+
+    def close(self) -> None:
+        if self._collector is not None:
+            self._collector.async_shutdown()
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"buffer": buffer_state(self.buffer, self._rng)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        load_buffer(self.buffer, self._rng, state["buffer"])
+
+    def _check_workers(self) -> None:
+        """TorchRL is silent about dead workers, and may wait for ever for their answer."""
+        processes = self._collector.procs
+        for index, process in enumerate(processes):
+            if not process.is_alive():
+                raise CollectorError(f"rollout worker {index} of {len(processes)} died, exit code {process.exitcode}")
+        now, delivered = time.monotonic(), self.buffer.write_count
+        if delivered != self._delivered:
+            self._delivered, self._delivered_at = delivered, now
+        elif now - self._delivered_at > self.patience:
+            raise CollectorError(f"{len(processes)} rollout workers delivered nothing for {self.patience:.0f} s")
+
+
+def _worker_env(recipe: Callable[[], ReachAvoidEnv], learner: int) -> ReachAvoidEnv:
+    """An environment in its worker, which leaves Ctrl-C to the learner's process."""
+    if os.getpid() != learner:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return recipe()

@@ -1,0 +1,87 @@
+"""One vectorised environment in the learner's process."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+
+from pirl_rl.collectors.buffers import buffer_state, check_sizes, load_buffer, make_buffer
+from pirl_rl.collectors.transitions import Exploration, Transitions, exploring_policy
+from pirl_rl.envs import ReachAvoidEnv
+from pirl_rl.networks import Actor
+
+
+class SyncCollector:
+    """Collects `frames_per_batch` transitions every `updates_per_batch` updates.
+
+    Args:
+        env: played in place.
+        actor: the learner's own, its parameters followed live.
+        frames_per_batch: transitions a batch, a multiple of the environment's batch size.
+        updates_per_batch: updates between two batches.
+        warmup_frames: transitions of uniformly random actions before the first update.
+        buffer_size: capacity of the replay buffer.
+        exploration_noise: deviation of the noise on actions.
+        exploration: when there is noise, "always" or at the "start" of episodes, see `Exploration`.
+        n_steps: length of returns; use noise at the start only where it is above 1.
+        seed: of the buffer's sampling.
+    """
+
+    def __init__(
+        self,
+        env: ReachAvoidEnv,
+        actor: Actor,
+        frames_per_batch: int = 256,
+        updates_per_batch: int = 8,
+        warmup_frames: int = 4_096,
+        buffer_size: int = 50_000,
+        exploration_noise: float = 0.2,
+        exploration: Literal["always", "start"] = "always",
+        n_steps: int = 1,
+        seed: int = 0,
+    ):
+        check_sizes(env, frames_per_batch, updates_per_batch, warmup_frames, buffer_size)
+        self.env, self.updates_per_batch, self.warmup_frames = env, updates_per_batch, warmup_frames
+        self.buffer, self._rng = make_buffer(buffer_size, env.device, seed)
+        self._collector = Collector(
+            env,
+            exploring_policy(actor, Exploration(exploration_noise, exploration)),
+            frames_per_batch=frames_per_batch,
+            total_frames=-1,
+            init_random_frames=-(-warmup_frames // frames_per_batch) * frames_per_batch,
+            track_traj_ids=False,
+            auto_register_policy_transforms=False,
+        )
+        self._batches = iter(self._collector)
+        self._transitions = Transitions(n_steps)
+
+    def start(self) -> None:
+        while len(self.buffer) < min(self.warmup_frames, self.buffer.storage.max_size):
+            self._collect()
+
+    def step(self, update: int) -> None:
+        if update % self.updates_per_batch == 0:
+            self._collect()
+
+    def close(self) -> None:
+        self._collector.shutdown()
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "buffer": buffer_state(self.buffer, self._rng),
+            "frames": self._collector.state_dict()["frames"],
+            "carrier": self._collector._carrier.to_dict(),
+            "env_rng": self.env.rng.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        load_buffer(self.buffer, self._rng, state["buffer"])
+        # TorchRL saves no environment state; the carried TensorDict is all that a ReachAvoidEnv has.
+        self._collector.load_state_dict({**self._collector.state_dict(), "frames": state["frames"]})  # type: ignore[arg-type]
+        self._collector._carrier.update(TensorDict(state["carrier"], device=self.env.device))
+        self.env.rng.set_state(state["env_rng"])
+
+    def _collect(self) -> None:
+        self.buffer.extend(self._transitions(next(self._batches)))

@@ -1,0 +1,51 @@
+"""`python -m pirl_rl.evaluate`: the same run measured again, with the samples that were asked for."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from small import small_trainer
+
+from pirl_rl import evaluate
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    return folder, small_trainer(folder, "evaluation.final=[exact,success]").train()
+
+
+def test_repeats_the_summary(run, capsys):
+    folder, summary = run
+    evaluate.main([f"run={folder}"])
+    results = json.loads((folder / "evaluation.json").read_text())
+    assert results == {name: summary[name] for name in results}
+    assert "value_mse" in results
+    assert "value_mse" in capsys.readouterr().out
+
+
+def test_takes_other_samples(run):
+    folder, summary = run
+    evaluate.main([f"run={folder}", "evaluation.final=[success]", "evaluation.success.episodes=2000"])
+    results = json.loads((folder / "evaluation.json").read_text())
+    width, before = (entry["success_high"] - entry["success_low"] for entry in (results, summary))
+    assert "value_mse" not in results
+    assert width < before / 2  # 2,000 episodes against the debug configuration's 64
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ([], "run=RUN_DIR"),
+        (["run=nowhere"], "nowhere is not a run directory"),
+        (["run={folder}", "evaluation.success.episods=3"], "episods"),
+        (["run={folder}", "evaluation.final=[excat]"], "excat"),
+        (["run={folder}", "evaluation.success._target_=os.system"], "os.system"),
+    ],
+)
+def test_mistakes_are_named(arguments, told, run, capsys):
+    with pytest.raises(SystemExit) as stop:
+        evaluate.main([argument.format(folder=run[0]) for argument in arguments])
+    assert stop.value.code == 1
+    assert told in capsys.readouterr().err
