@@ -134,7 +134,7 @@ def _per_seed(axes: Axes, groups: dict[str, list[Run]], name: str, title: str, y
             axes.plot(i + spread, values, "o", ms=4, alpha=0.7, color=color)
             axes.plot([i - 0.35, i + 0.35], [values.mean()] * 2, color=color, lw=2)
     axes.set(title=f"{title}, line: mean", ylabel=ylabel, xlim=(-0.6, len(groups) - 0.4))
-    axes.set_xticks(range(len(groups)), [label.replace(" ", "\n") for label in groups], fontsize="small")
+    axes.set_xticks(range(len(groups)), list(groups), fontsize="small", rotation=30, ha="right")
     axes.grid(axis="y", alpha=0.3)
 
 
