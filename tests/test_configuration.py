@@ -26,6 +26,7 @@ def make(horizon: float = 3.0):
 @pytest.fixture
 def my_module(tmp_path, monkeypatch):
     (tmp_path / "my_module.py").write_text(MODULE)
+    sys.modules.pop("my_module", None)
     monkeypatch.syspath_prepend(tmp_path)
     yield
     sys.modules.pop("my_module", None)

@@ -68,6 +68,7 @@ def test_every_experiment_trains(experiment, cli, tmp_path, monkeypatch):
     own = []
     if experiment == "own":
         (tmp_path / "my_module.py").write_text(OWN.replace("OFFSET", "1.5"))
+        sys.modules.pop("my_module", None)
         monkeypatch.syspath_prepend(tmp_path)
         own = ["env.problem._target_=my_module.MyProblem"]
     code, text = cli(f"+experiment={experiment}", "+debug=default", *SMALL, *own)
