@@ -136,7 +136,7 @@ class Learner:
             except BackendCompilerFailed as error:
                 self.compile = False
                 reason = str(error).partition("\n")[0]
-                warnings.warn(f"updates run eagerly, two to three times slower: {reason}", stacklevel=3)
+                warnings.warn(f"updates run eagerly, about half as fast: {reason}", stacklevel=3)
         return getattr(self.loss, name)(batch)
 
     @staticmethod
