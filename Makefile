@@ -29,8 +29,8 @@ bench: $(READY) ## Time the learner and the simulator on one thread
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/learner.py
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/simulator.py
 
-figures: $(READY) ## Draw the comparison of methods from its runs
-	$(BIN)/python -m pirl_rl.compare runs/reach1d_comparison
+figures: $(READY) ## Compare all runs below runs/: a table and a figure in docs/figures
+	$(BIN)/python -m pirl_rl.compare runs --out docs/figures
 
 clean: ## Remove .venv, caches and build output; runs stay
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache
