@@ -28,9 +28,10 @@ WEIGHTS = ("td_weight", "hjb_weight", "boundary_weight")
 class PIRLLoss(TD3Loss):
     """TD3 targets with collocation HJB and boundary terms.
 
-    `forward` takes a TensorDict with "replay" (transitions), and where the physics is wanted "collocation" (tau, state,
-    mask) and "boundary" (tau, state, value); it returns "loss_qvalue" and "loss_actor", each named by its optimiser,
-    and the unweighted "td_loss", "hjb_loss", "boundary_loss", summed over the critics.
+    `forward` takes a TensorDict with "replay" (transitions, or states without "next" where no TD term is wanted), and
+    where the physics is wanted "collocation" (tau, state, mask) and "boundary" (tau, state, value). It returns
+    "loss_qvalue" and "loss_actor", each named by its optimiser, and the unweighted "td_loss", "hjb_loss",
+    "boundary_loss", summed over the critics.
 
     Args:
         problem: the physics.
@@ -111,8 +112,10 @@ class PIRLLoss(TD3Loss):
         """The weighted critic loss and its unweighted parts; each term is there if its part of the batch is."""
         # TD3Loss draws its smoothing noise first; so do we, for the same stream.
         noise = self._clipped_noise(batch["replay", "action"], self.policy_noise, self.noise_clip)
-        parts = {"td_loss": self._td_loss(batch["replay"], noise)}
-        loss = self.td_weight * parts["td_loss"]
+        parts, loss = {}, self.td_weight.new_zeros(())
+        if "next" in batch["replay"].keys():
+            parts["td_loss"] = self._td_loss(batch["replay"], noise)
+            loss = loss + self.td_weight * parts["td_loss"]
         if "collocation" in batch.keys():
             parts["hjb_loss"] = self._hjb_loss(batch["collocation"])
             loss = loss + self.hjb_weight * parts["hjb_loss"]

@@ -96,7 +96,7 @@ class Trainer:
         self.rng = torch.Generator(self.solution.device).manual_seed(seed)
         # A term whose weight is zero all along the run is left out of the work.
         weights = [learner.schedule(k) for k in (*range(0, updates, max(1, updates // 1_000)), updates)]
-        self.physics = tuple(max(values) > 0 for values in zip(*weights, strict=True))[1:]
+        self.terms = tuple(max(values) > 0 for values in zip(*weights, strict=True))
         self.update, self.saved, self.wall_seconds = 0, 0, 0.0
 
     def train(self) -> dict[str, float]:
@@ -141,10 +141,12 @@ class Trainer:
 
     def sample(self) -> TensorDict:
         """The batch of one update."""
-        parts = {"replay": self.collector.buffer.sample(self.batch_size)}
-        if self.physics[0]:
+        td, hjb, boundary = self.terms
+        replay = self.collector.buffer.sample(self.batch_size)
+        parts = {"replay": replay if td else replay.exclude("next")}
+        if hjb:
             parts["collocation"] = self.collocation.sample(self.rng)
-        if self.physics[1]:
+        if boundary:
             parts["boundary"] = self.boundary.sample(self.rng)
         return TensorDict(parts).to(self.solution.device)
 

@@ -99,9 +99,12 @@ def test_rows_hold_the_weights_losses_and_evaluations(whole):
     assert float(rows[20]["learning_rate"]) < float(rows[1]["learning_rate"])
 
 
-def test_physics_without_weight_is_left_out(tmp_path):
-    assert small_trainer(tmp_path, "method=td3").physics == (False, False)
-    assert small_trainer(tmp_path, "method=pirl").physics == (True, True)
+def test_terms_without_weight_are_left_out(tmp_path):
+    kept = {"td3": {"td_loss"}, "pinn": {"hjb_loss", "boundary_loss"}, "pirl": {"td_loss", "hjb_loss", "boundary_loss"}}
+    for method, terms in kept.items():
+        trainer = small_trainer(tmp_path / method, f"method={method}")
+        trainer.collector.start()
+        assert set(trainer.learner.loss.critic_loss(trainer.sample())[1]) == terms
 
 
 def test_nan_stops_with_update_and_term(tmp_path):
