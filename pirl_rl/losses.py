@@ -113,7 +113,7 @@ class PIRLLoss(TD3Loss):
         # TD3Loss draws its smoothing noise first; so do we, for the same stream.
         noise = self._clipped_noise(batch["replay", "action"], self.policy_noise, self.noise_clip)
         parts, loss = {}, self.td_weight.new_zeros(())
-        if "next" in batch["replay"].keys():
+        if "next" in batch.get("replay").keys():
             parts["td_loss"] = self._td_loss(batch["replay"], noise)
             loss = loss + self.td_weight * parts["td_loss"]
         if "collocation" in batch.keys():
