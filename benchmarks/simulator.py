@@ -1,9 +1,12 @@
-"""Transitions a second on one thread: `env.step`, and the same through TorchRL's collector.
+"""Transitions a second on one thread: `env.step`, the same through TorchRL's collector, and the vehicle's steps.
 
     python benchmarks/simulator.py [--rounds 20]
 
 Reach1D under u = 1, Brownian bridge, dt = 0.1, physics included; steps start from freshly drawn states, which costs
 `env.step` nothing. The collector resets ended episodes itself. Figures are medians over the rounds.
+
+DriftEnv at batch 8,192 under delta' = 0 and F_x = 3 kN, dt = 0.1 and the bridge as above: vehicle steps a second with
+one sub-step, sub-steps a second with ten.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 
-from pirl_rl.envs import Reach1DEnv
+from pirl_rl.envs import DriftEnv, Reach1DEnv, ReachAvoidEnv
 
 
 def push(tau: torch.Tensor) -> torch.Tensor:
@@ -29,9 +32,9 @@ def flatten(data: TensorDictBase) -> TensorDictBase:
     return data.reshape(-1)
 
 
-def step_rate(env: Reach1DEnv, steps: int) -> float:
+def step_rate(env: ReachAvoidEnv, steps: int, action: float = 1.0) -> float:
     start = env.reset()
-    start["action"] = push(start["tau"])
+    start["action"] = torch.full(env.action_spec.shape, action)
     env.step(start)
     begin = time.perf_counter()
     for _ in range(steps):
@@ -66,6 +69,12 @@ def main() -> None:
         stepped = statistics.median(step_rate(env, 100) for _ in range(rounds)) / 1e6
         collected = statistics.median(collector_rates(env, 20 * batch, rounds)) / 1e6
         print(f"| {batch:,} | {stepped:.2f} | {collected:.2f} |")
+    print("\n| DriftEnv at batch 8,192, one thread | million/s |")
+    print("|:--|--:|")
+    for substeps, unit in ((1, "one sub-step: vehicle steps"), (10, "ten sub-steps: sub-steps")):
+        env = DriftEnv(substeps=substeps, num_envs=8_192, seed=0)
+        rate = statistics.median(step_rate(env, 20 // substeps, action=0.0) for _ in range(rounds))
+        print(f"| {unit} | {substeps * rate / 1e6:.2f} |")
 
 
 if __name__ == "__main__":

@@ -15,10 +15,12 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from pirl_rl import checkpoint
 from pirl_rl.checkpoint import CheckpointError
 from pirl_rl.configuration import ConfigError, build, convert
+from pirl_rl.curriculum import Curriculum, Stage
 from pirl_rl.envs import ReachAvoidEnv
 from pirl_rl.evaluation import Evaluator
 from pirl_rl.losses import PIRLLoss
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.simulator import Simulator
 from pirl_rl.trainer import Trainer
 
 
@@ -43,8 +45,22 @@ def make_loss(config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[st
     with warnings.catch_warnings():
         # The learner's SoftUpdate comes later, or never where nothing is trained.
         warnings.filterwarnings("ignore", message="No target network updater")
-        loss = build(config.loss, "loss", trust, problem=problem, actor=actor, critics=critics)
+        loss = build(
+            config.loss,
+            "loss",
+            trust,
+            problem=problem,
+            actor=actor,
+            critics=critics,
+            simulator=_simulator(config, problem),
+        )
     return loss.to(pick_device(config.device))
+
+
+def _simulator(config: DictConfig, problem: ReachAvoidProblem) -> Simulator:
+    """What the environment plays."""
+    steps = {name: config.env[name] for name in ("dt", "substeps", "crossing") if name in config.env}
+    return Simulator(problem, **steps)
 
 
 def make_trainer(config: DictConfig, folder: Path | None = None, trust: Sequence[str] = ()) -> Trainer:
@@ -64,7 +80,10 @@ def make_trainer(config: DictConfig, folder: Path | None = None, trust: Sequence
     problem = env.problem
     loss = make_loss(config, problem, trust)
     actor = loss.actor_network.module
-    schedule = build(config.schedule, "schedule", trust)
+    schedule, stages = build(config.schedule, "schedule", trust), None
+    if config.stages:
+        stages = [_make_stage(node, f"stages[{i}]", trust, problem) for i, node in enumerate(config.stages)]
+        schedule = stages = Curriculum(schedule, convert(config.trainer.updates, int, "trainer.updates"), stages)
     return build(
         config.trainer,
         "trainer",
@@ -75,11 +94,23 @@ def make_trainer(config: DictConfig, folder: Path | None = None, trust: Sequence
         boundary=build(config.boundary, "boundary", trust, problem=problem),
         during=make_evaluators(config.evaluation, "during", trust),
         final=make_evaluators(config.evaluation, "final", trust),
+        stages=stages,
         logger=build(config.logger, "logger", trust),
         folder=folder,
         config=OmegaConf.to_container(config, resolve=True),
         seed=points,
     )
+
+
+def _make_stage(node: DictConfig, key: str, trust: Sequence[str], problem: ReachAvoidProblem) -> Stage:
+    parts = {str(name): node[name] for name in node}
+    for name, extra in (("schedule", {}), ("initial_states", {}), ("collocation", {"problem": problem})):
+        if node.get(name) is not None:
+            parts[name] = build(node[name], f"{key}.{name}", trust, **extra)
+    try:
+        return Stage(**parts)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{key}: {error}") from None
 
 
 def make_evaluators(config: DictConfig, when: str, trust: Sequence[str]) -> list[Evaluator]:

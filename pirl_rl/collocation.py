@@ -6,10 +6,11 @@ A or B, or have tau outside (0, T], are masked, not dropped.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from pirl_rl.initial_states import sample_interior
@@ -47,8 +48,15 @@ class Collocation:
         self.problem, self.size, self.sampler, self.tau_power = problem, size, sampler, tau_power
         self.box = problem.states.expand(widen)
 
-    def sample(self, generator: torch.Generator) -> TensorDict:
-        """{"tau" (size, 1), "state" (size, n), "mask" (size,)}."""
+    def sample(
+        self, generator: torch.Generator, replay: TensorDictBase | None = None, progress: float = 0.0
+    ) -> TensorDict:
+        """{"tau" (size, 1), "state" (size, n), "mask" (size,)}.
+
+        Args:
+            replay: transitions of the update, for samplers that stay near visited states.
+            progress: of the loss schedule, for samplers that move with it.
+        """
         unit = self._unit(generator)
         # 1 - U lies in (0, 1]: tau = 0 belongs to the boundary.
         tau = self.problem.horizon * (1 - unit[:, :1]) ** self.tau_power
@@ -58,7 +66,8 @@ class Collocation:
     def mask(self, tau: Tensor, state: Tensor) -> Tensor:
         """(N,) bool: points where the HJB equation holds."""
         t = tau.squeeze(-1)
-        return self.problem.interior(state) & (t > 0) & (t <= self.problem.horizon)
+        known = ~self.problem.interior(state) | self.problem.unreachable(state)
+        return ~known & (t > 0) & (t <= self.problem.horizon)
 
     def _unit(self, generator: torch.Generator) -> Tensor:
         dim = 1 + self.box.dim
@@ -67,6 +76,54 @@ class Collocation:
         seed = int(torch.randint(2**31, (), generator=generator, device=generator.device))
         engine = torch.quasirandom.SobolEngine(dim, scramble=True, seed=seed)
         return engine.draw(self.size).to(generator.device)
+
+
+class ReplayCollocation(Collocation):
+    """Points near those that the policy visits, in the dimensions where a box is mostly empty, and a rest as above.
+
+    A visited (tau, x) is moved by independent normal steps in the coordinates in which (0, T] x states is a cube of
+    width 2. Both the share of such points and the deviation of the steps move with the loss schedule, as in the
+    transition and the refinement stages of the paper.
+
+    Args:
+        problem, size, sampler, widen, tau_power: as of `Collocation`, for the rest.
+        replay_share: share of points near visited ones, at the schedule's start and end.
+        jitter: deviation of the steps, at the schedule's start and end.
+    """
+
+    def __init__(
+        self,
+        problem: ReachAvoidProblem,
+        size: int = 1_000,
+        sampler: Literal["uniform", "sobol"] = "uniform",
+        widen: float = 1.0,
+        tau_power: float = 1.0,
+        replay_share: Sequence[float] = (1.0, 1.0),
+        jitter: Sequence[float] = (0.0, 0.0),
+    ):
+        super().__init__(problem, size, sampler, widen, tau_power)
+        for name, ends, most in (("replay_share", replay_share, 1.0), ("jitter", jitter, float("inf"))):
+            if len(ends) != 2 or not all(0 <= end <= most for end in ends):
+                raise ValueError(f"collocation.{name}: expected [start, end] from 0 to {most:g}, got {list(ends)}")
+        self.replay_share, self.jitter = tuple(replay_share), tuple(jitter)
+
+    def sample(
+        self, generator: torch.Generator, replay: TensorDictBase | None = None, progress: float = 0.0
+    ) -> TensorDict:
+        rest = super().sample(generator, replay, progress)
+        if replay is None:
+            return rest
+        share, jitter = (start + (end - start) * progress for start, end in (self.replay_share, self.jitter))
+        device, horizon = generator.device, self.problem.horizon
+        index = torch.randint(len(replay), (self.size,), generator=generator, device=device)
+        step = jitter * torch.randn(self.size, 1 + self.problem.states.dim, generator=generator, device=device)
+        # Reflected at both ends of (0, T]: a negative tau has no root, and NaN at a masked point spoils all gradients.
+        tau = torch.abs(replay["tau"][index] + step[:, :1] * horizon / 2)
+        tau = horizon - torch.abs(horizon - tau)
+        state = self.problem.states.denormalize(self.problem.states.normalize(replay["state"][index]) + step[:, 1:])
+        taken = torch.rand(self.size, 1, generator=generator, device=device) < share
+        tau, state = torch.where(taken, tau, rest["tau"]), torch.where(taken, state, rest["state"])
+        return TensorDict({"tau": tau, "state": state, "mask": self.mask(tau, state)}, batch_size=[self.size])
 
 
 class BoundarySampler:
@@ -81,6 +138,7 @@ class BoundarySampler:
         faces: points a draw on the faces.
         widen: the box of the points at tau = 0 is wider than `states` by this factor.
         tau_power: tau = T U^tau_power on the faces, as in `Collocation`.
+        replay_share: share of the points at tau = 0 that are visited states instead.
         seed: of the pool.
 
     Raises:
@@ -94,6 +152,7 @@ class BoundarySampler:
         faces: int = 100,
         widen: float = 1.0,
         tau_power: float = 1.0,
+        replay_share: float = 0.0,
         seed: int = 0,
     ):
         if initial < 0 or faces < 0 or initial + faces < 1:
@@ -101,14 +160,20 @@ class BoundarySampler:
         if not widen > 0 or not tau_power > 0:
             raise ValueError(f"boundary: expected widen > 0 and tau_power > 0, got {widen} and {tau_power}")
         self.problem, self.initial, self.faces, self.tau_power = problem, initial, faces, tau_power
-        self.box = problem.states.expand(widen)
+        if not 0 <= replay_share <= 1:
+            raise ValueError(f"boundary.replay_share: expected 0 <= replay_share <= 1, got {replay_share}")
+        self.replay_share, self.box = replay_share, problem.states.expand(widen)
         generator = torch.Generator().manual_seed(seed)
         self._pool = _face_pool(problem, generator)
 
-    def sample(self, generator: torch.Generator) -> TensorDict:
-        """{"tau" (N, 1), "state" (N, n), "value" (N,)} with N = initial + faces."""
+    def sample(self, generator: torch.Generator, replay: TensorDictBase | None = None) -> TensorDict:
+        """{"tau" (N, 1), "state" (N, n), "value" (N,)} with N = initial + faces; `replay` holds the visited states."""
         device, dtype = generator.device, torch.get_default_dtype()
         state = sample_interior(self.problem, self.box, self.initial, generator, dtype)
+        visited = 0 if replay is None else round(self.replay_share * self.initial)
+        if replay is not None and visited:
+            index = torch.randint(len(replay), (visited,), generator=generator, device=device)
+            state = torch.cat([replay["state"][index], state[visited:]])
         value, tau = self.problem.boundary_value(state), torch.zeros(self.initial, 1, device=device)
         if self.faces:
             points, values = (entry.to(device) for entry in self._pool)

@@ -16,9 +16,9 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from pirl_rl.initial_states import UniformStates
+from pirl_rl.initial_states import InitialStates, UniformStates
 from pirl_rl.problem import ReachAvoidProblem, check_problem
-from pirl_rl.problems import Reach1D
+from pirl_rl.problems import Reach1D, VehicleDrift
 from pirl_rl.simulator import Simulator, exit_value
 
 
@@ -48,7 +48,7 @@ class ReachAvoidEnv(EnvBase):
         dt: float = 0.1,
         substeps: int = 1,
         crossing: str = "bridge",
-        initial_states: UniformStates | None = None,
+        initial_states: InitialStates | None = None,
         num_envs: int = 64,
         seed: int | None = None,
         device: torch.device | str = "cpu",
@@ -58,9 +58,8 @@ class ReachAvoidEnv(EnvBase):
             raise ValueError(f"num_envs: expected an integer >= 1, got {num_envs!r}")
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.problem = problem
-        self._arguments = {"dt": dt, "substeps": substeps, "crossing": crossing, "initial_states": initial_states}
         self.simulator = Simulator(problem, dt, substeps, crossing)  # type: ignore[arg-type]
-        self.initial_states = initial_states or UniformStates()
+        self.initial_states: InitialStates = initial_states or UniformStates()
         self.max_steps = round(problem.horizon / dt)
         self._make_specs()
         self.rng = torch.Generator(device=self.device)
@@ -68,7 +67,11 @@ class ReachAvoidEnv(EnvBase):
 
     def recipe(self, seed: int) -> Callable[[], ReachAvoidEnv]:
         """A picklable call that builds this environment again, with another seed, on the CPU."""
-        return partial(ReachAvoidEnv, self.problem, **self._arguments, num_envs=self.batch_size[0], seed=seed)
+        steps = {name: getattr(self.simulator, name) for name in ("dt", "substeps", "crossing")}
+        envs = self.batch_size[0]
+        return partial(
+            ReachAvoidEnv, self.problem, **steps, initial_states=self.initial_states, num_envs=envs, seed=seed
+        )
 
     def _make_specs(self) -> None:
         problem, bs, device = self.problem, self.batch_size, self.device
@@ -86,8 +89,11 @@ class ReachAvoidEnv(EnvBase):
         self.done_spec = Composite(done=flag, terminated=flag.clone(), shape=bs, device=device)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+        visited = None
+        if tensordict is not None and "_reset" in tensordict.keys() and "state" in tensordict.keys():
+            visited = tensordict["state"][~tensordict["_reset"].reshape(-1)]
         steps, state = self.initial_states.sample(
-            self.problem, self.batch_size[0], self.max_steps, self.rng, torch.get_default_dtype()
+            self.problem, self.batch_size[0], self.max_steps, self.rng, torch.get_default_dtype(), visited
         )
         none = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
         return TensorDict(
@@ -132,3 +138,10 @@ class Reach1DEnv(ReachAvoidEnv):
 
     def __init__(self, **kwargs):
         super().__init__(Reach1D(), **kwargs)
+
+
+class DriftEnv(ReachAvoidEnv):
+    """The paper's vehicle drifting, exits watched at the ends of sub-steps; other arguments as of `ReachAvoidEnv`."""
+
+    def __init__(self, crossing: str = "endpoint", **kwargs):
+        super().__init__(VehicleDrift(), crossing=crossing, **kwargs)

@@ -1,6 +1,7 @@
 """Evaluate: `python -m pirl_rl.evaluate run=RUN_DIR [evaluation.success.episodes=100000 ...]`.
 
-Runs a finished run's evaluators again, with other samples or simulators if asked, and leaves `evaluation.json` in it.
+Runs a finished run's evaluators again, with other samples or simulators if asked, leaves `evaluation.json` in it and
+draws its figures.
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ from pirl_rl.configuration import ConfigError, load_config
 from pirl_rl.console import named_modules, override, table, told
 from pirl_rl.evaluation import evaluate
 from pirl_rl.files import replacing
-from pirl_rl.runs import load_run
+from pirl_rl.loggers import METRICS_FILE
+from pirl_rl.plots import FIGURES, draw_run
+from pirl_rl.runs import load_run, refuse_links
 
 RESULTS = "evaluation.json"
 
@@ -34,10 +37,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
             override(config, text)
         trust = [*config.trust, *named_modules(overrides)]
         evaluators = make_evaluators(config.evaluation, "final", trust)
-        metrics = evaluate(load_run(folder, trust, device=config.device).solution, evaluators)
+        solution = load_run(folder, trust, device=config.device).solution
+        refuse_links(folder)
+        metrics = evaluate(solution, evaluators)
         with replacing(folder / RESULTS) as file:
             file.write(json.dumps(metrics, indent=2) + "\n")
+        figures = draw_run(solution, folder / METRICS_FILE, folder / FIGURES, evaluators)
     print(table(metrics))
+    for figure in figures:
+        print(f"figure   {figure}")
     print(f"written  {folder / RESULTS}")
 
 

@@ -33,7 +33,7 @@ class Learner:
         decay: "cosine" lets the rate fall to zero along a quarter wave, "constant" keeps it.
         actor_every: critic updates for each update of the actor and the targets (d_up).
         polyak: rate of the targets.
-        compile: compile both losses; where that fails, as without a C++ compiler, they run eagerly after one warning.
+        compile: compile the losses; where that fails, as without a C++ compiler, they run eagerly after one warning.
     """
 
     def __init__(
@@ -59,7 +59,9 @@ class Learner:
         self.critic_optimizer = _adam(loss.qvalue_network_params, learning_rate)
         self.actor_optimizer = _adam(loss.actor_network_params, learning_rate)
         self.compile = compile
-        self._compiled = {name: torch.compile(getattr(loss, name)) for name in ("critic_loss", "actor_loss")}
+        if compile:
+            for name in loss.compilable:
+                setattr(loss, name, torch.compile(getattr(loss, name)))
         self._loss_actor = torch.tensor(math.nan)
 
     def update(self, batch: TensorDictBase, k: int, progress: float) -> dict[str, Tensor]:
@@ -130,14 +132,17 @@ class Learner:
 
     def _evaluate(self, name: str, batch: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """A loss of the module, compiled where that works."""
-        if self.compile:
-            try:
-                return self._compiled[name](batch)
-            except BackendCompilerFailed as error:
-                self.compile = False
-                reason = str(error).partition("\n")[0]
-                warnings.warn(f"updates run eagerly, about half as fast: {reason}", stacklevel=3)
-        return getattr(self.loss, name)(batch)
+        try:
+            return getattr(self.loss, name)(batch)
+        except BackendCompilerFailed as error:
+            if not self.compile:
+                raise
+            self.compile = False
+            for compiled in self.loss.compilable:
+                delattr(self.loss, compiled)
+            reason = str(error).partition("\n")[0]
+            warnings.warn(f"updates run eagerly, about half as fast: {reason}", stacklevel=3)
+            return getattr(self.loss, name)(batch)
 
     @staticmethod
     def _step(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:

@@ -21,7 +21,9 @@ from torchrl.objectives import TD3Loss
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.operators import advection, generator, require_twice_differentiable
 from pirl_rl.problem import ReachAvoidProblem, has_controlled_noise
+from pirl_rl.simulator import Simulator
 
+TD_CRITERIA = {"squares": nn.functional.mse_loss, "cross_entropy": nn.functional.binary_cross_entropy}
 WEIGHTS = ("td_weight", "hjb_weight", "boundary_weight")
 
 
@@ -37,6 +39,9 @@ class PIRLLoss(TD3Loss):
         problem: the physics.
         actor: pi(tau, x).
         critics: two for TD3; one, with `policy_noise=0`, is DDPG's critic rule.
+        td_criterion: "squares" as in the paper, or "cross_entropy" between target and value, which suits probabilities
+            and needs critics in (0, 1).
+        target_critics: the target is the "min" of the critics, as in TD3, or their "mean", which is not biased low.
         policy_noise: deviation of the target policy's smoothing noise, in [-1, 1] coordinates of the control.
         noise_clip: bound of that noise.
         hjb_noise: deviation of the noise on the action of the HJB residual; biases V low, 0 by default.
@@ -45,7 +50,13 @@ class PIRLLoss(TD3Loss):
             can follow do not outweigh the rest; None squares all, as in the paper.
         boundary_delta: the same for the error of V on the boundary.
         actor_rule: "q" ascends Q_1(y, pi(y)), Eq. (actor_loss); "hamiltonian" ascends f(x, pi) . grad V +
-            1/2 Tr(sigma sigma^T hess V) at fixed V, the HJB equation's own rule; "both" adds them.
+            1/2 Tr(sigma sigma^T hess V) at fixed V, the HJB equation's own rule; "both" adds them; "model" ascends V
+            at the end of `model_steps` noise-free control steps of `simulator`, what the Hamiltonian becomes where a
+            control is held.
+        model_steps: control steps that "model" looks ahead.
+        simulator: plays them.
+        logit_penalty: factor of the mean square of the actor's outputs before their tanh, added to the actor's loss:
+            where tanh saturates, no gradient would bring a wrong action back.
         td_weight, hjb_weight, boundary_weight: initial weights of the three terms.
 
     Raises:
@@ -64,21 +75,38 @@ class PIRLLoss(TD3Loss):
         actor: Actor,
         critics: Sequence[Critic],
         *,
+        td_criterion: Literal["squares", "cross_entropy"] = "squares",
+        target_critics: Literal["min", "mean"] = "min",
         policy_noise: float = 0.2,
         noise_clip: float = 0.5,
         hjb_noise: float = 0.0,
         hjb_noise_clip: float = 1.0,
         hjb_delta: float | None = None,
         boundary_delta: float | None = None,
-        actor_rule: Literal["q", "hamiltonian", "both"] = "both",
+        actor_rule: Literal["q", "hamiltonian", "both", "model"] = "both",
+        model_steps: int = 1,
+        simulator: Simulator | None = None,
+        logit_penalty: float = 0.0,
         td_weight: float = 1.0,
         hjb_weight: float = 0.0,
         boundary_weight: float = 0.0,
     ):
-        if actor_rule not in ("q", "hamiltonian", "both"):
-            raise ValueError(f"loss.actor_rule: expected 'q', 'hamiltonian' or 'both', got {actor_rule!r}")
-        if actor_rule != "hamiltonian" and not all(critic.action_input for critic in critics):
-            raise ValueError(f"loss.actor_rule: critics without the action need 'hamiltonian', got {actor_rule!r}")
+        if actor_rule not in ("q", "hamiltonian", "both", "model"):
+            raise ValueError(f"loss.actor_rule: expected 'q', 'hamiltonian', 'both' or 'model', got {actor_rule!r}")
+        if actor_rule in ("q", "both") and not all(critic.action_input for critic in critics):
+            raise ValueError(
+                f"loss.actor_rule: critics without the action need 'hamiltonian' or 'model', got {actor_rule!r}"
+            )
+        if actor_rule == "model" and simulator is None:
+            raise ValueError("loss.simulator: expected a simulator for actor_rule 'model', got none")
+        if td_criterion not in TD_CRITERIA:
+            raise ValueError(f"loss.td_criterion: expected one of {', '.join(TD_CRITERIA)}, got {td_criterion!r}")
+        if td_criterion == "cross_entropy" and not all(isinstance(critic.layers[-1], nn.Sigmoid) for critic in critics):
+            raise ValueError("loss.td_criterion: 'cross_entropy' needs critics with output 'Sigmoid'")
+        if target_critics not in ("min", "mean"):
+            raise ValueError(f"loss.target_critics: expected 'min' or 'mean', got {target_critics!r}")
+        if model_steps < 1:
+            raise ValueError(f"loss.model_steps: expected at least 1, got {model_steps}")
         for critic in critics:
             require_twice_differentiable(critic.layers)
         one = torch.ones(problem.controls.dim)
@@ -101,9 +129,11 @@ class PIRLLoss(TD3Loss):
         self.target_qvalue_network_params.data.copy_(own)
         self.make_value_estimator(gamma=1.0)
         self.problem = problem
+        self.td_criterion, self.target_critics = td_criterion, target_critics
         self.hjb_noise, self.hjb_noise_clip = hjb_noise, hjb_noise_clip
         self.hjb_delta, self.boundary_delta = hjb_delta, boundary_delta
-        self.actor_rule = actor_rule
+        self.actor_rule, self.model_steps, self.simulator = actor_rule, model_steps, simulator
+        self.logit_penalty = logit_penalty
         self._hamiltonian_operator = generator if has_controlled_noise(problem) else advection
         for name, value in zip(WEIGHTS, (td_weight, hjb_weight, boundary_weight), strict=True):
             self.register_coeff_buffer(name, float(value))
@@ -128,11 +158,16 @@ class PIRLLoss(TD3Loss):
         """The actor's loss by its rule; no gradient reaches the critics."""
         tau, x = batch["replay", "tau"], batch["replay", "state"]
         loss = torch.zeros((), device=tau.device)
-        if self.actor_rule != "hamiltonian":
+        if self.logit_penalty:
+            with self._actor() as actor:
+                loss = loss + self.logit_penalty * actor.logits(tau, x).square().mean()
+        if self.actor_rule == "model":
+            return loss - self._look_ahead(tau, x), {}
+        if self.actor_rule in ("q", "both"):
             action = self.act(tau, x)
             with self.critics("frozen") as critic:
                 loss = loss - critic(tau, x, action)[0].mean()
-        if self.actor_rule != "q":
+        if self.actor_rule in ("hamiltonian", "both"):
             points = batch["collocation"] if "collocation" in batch.keys() else batch["replay"]
             loss = loss - self._hamiltonian(points)
         return loss, {}
@@ -146,11 +181,27 @@ class PIRLLoss(TD3Loss):
         loss_qvalue, parts = self.critic_loss(tensordict)
         return TensorDict({"loss_actor": loss_actor, "loss_qvalue": loss_qvalue, **parts})
 
+    @property
+    def compilable(self) -> tuple[str, ...]:
+        """Methods worth compiling. Looking ahead, the actor's loss is a loop over `flow`: compiled as a whole, it would
+        be unrolled into thousands of operations."""
+        return ("critic_loss", "flow" if self.actor_rule == "model" else "actor_loss")
+
+    def flow(self, x: Tensor, u: Tensor) -> Tensor:
+        """The noise-free control step of the simulator."""
+        assert self.simulator is not None
+        return self.simulator.flow(x, u)
+
     def act(self, tau: Tensor, state: Tensor, target: bool = False) -> Tensor:
         """The (target) actor's output: (N, 1), (N, n) -> (N, m) in [-1, 1]."""
+        with self._actor(target) as actor:
+            return actor(tau, state)
+
+    @contextmanager
+    def _actor(self, target: bool = False) -> Iterator[Actor]:
         params = self.target_actor_network_params if target else self.actor_network_params
         with params.to_module(self.actor_network, preserve_module_state=False):
-            return self.actor_network.module(tau, state)
+            yield self.actor_network.module  # type: ignore[misc]
 
     @contextmanager
     def critics(self, kind: Literal["online", "frozen", "target"] = "online") -> Iterator[Critic]:
@@ -177,11 +228,13 @@ class PIRLLoss(TD3Loss):
         with torch.no_grad():
             action = (self.act(tau, x, target=True) + noise).clamp(-1, 1)
             with self.critics("target") as critic:
-                value = critic(tau, x, action).amin(0)
+                values = critic(tau, x, action)
+                value = values.amin(0) if self.target_critics == "min" else values.mean(0)
             target = replay["next", "reward"] + (~replay["next", "terminated"]) * value
         with self.critics() as critic:
             value = critic(replay["tau"], replay["state"], replay["action"])
-        return (value - target).square().squeeze(-1).sum(0).mean()
+        error = TD_CRITERIA[self.td_criterion](value, target.expand_as(value), reduction="none")
+        return error.squeeze(-1).sum(0).mean()
 
     def _hjb_loss(self, points: TensorDictBase) -> Tensor:
         """L_PDE summed over critics: the mean of (L^u Q_i)^2 over unmasked points, u = pi^-(y) + noise."""
@@ -214,6 +267,19 @@ class PIRLLoss(TD3Loss):
             value = self._hamiltonian_operator(critic.at(action.detach()), self.problem, tau.squeeze(-1), x, u).mean(0)
         mask = points["mask"] if "mask" in points.keys() else torch.ones_like(value, dtype=torch.bool)
         return _masked_mean(value, mask)
+
+    def _look_ahead(self, tau: Tensor, x: Tensor) -> Tensor:
+        """Mean V at the end of noise-free control steps from tau (N, 1) and x (N, n), or where they meet A or B."""
+        assert self.simulator is not None
+        dt = self.simulator.dt
+        for _ in range(self.model_steps):
+            # Half a step of tolerance: tau is a whole number of steps up to rounding.
+            live = self.problem.interior(x).unsqueeze(-1) & (tau > dt / 2)
+            moved = self.flow(x, self.problem.controls.denormalize(self.act(tau, x)))
+            tau, x = torch.where(live, tau - dt, tau), torch.where(live, moved, x)
+        with self.critics("frozen") as critic:
+            value = critic(tau, x, self.act(tau, x).detach()).mean(0).squeeze(-1)
+        return torch.where(self.problem.reached(x), torch.ones_like(value), value).mean()
 
     @staticmethod
     def _clipped_noise(like: Tensor, deviation: float, bound: float) -> Tensor:

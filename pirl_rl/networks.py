@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.sets import Box
 
 ROOT_TIME_OFFSET = 1e-4
 """tau_0 of `RootTime` as a fraction of the horizon."""
@@ -65,8 +66,9 @@ def _stack(
     activation: str,
     output: str | None,
     root_time: bool,
+    box: Box,
 ) -> nn.Sequential:
-    low, high = (0.0, *problem.states.low), (problem.horizon, *problem.states.high)
+    low, high = (0.0, *box.low), (problem.horizon, *box.high)
     low, high = (*low, *[-1.0] * controls), (*high, *[1.0] * controls)
     layers: list[nn.Module] = []
     if root_time:
@@ -95,14 +97,26 @@ class Actor(nn.Module):
         problem: gives the scaling and the sizes.
         hidden: widths of the hidden layers.
         activation: name of a module of `torch.nn`.
+        scaling: box of states that the first layer maps to [-1, 1]; default `problem.states`.
     """
 
-    def __init__(self, problem: ReachAvoidProblem, hidden: Sequence[int] = (32, 32), activation: str = "ReLU"):
+    def __init__(
+        self,
+        problem: ReachAvoidProblem,
+        hidden: Sequence[int] = (32, 32),
+        activation: str = "ReLU",
+        scaling: Box | None = None,
+    ):
         super().__init__()
-        self.layers = _stack(problem, 0, hidden, problem.controls.dim, activation, "Tanh", root_time=False)
+        box = scaling or problem.states
+        self.layers = _stack(problem, 0, hidden, problem.controls.dim, activation, "Tanh", root_time=False, box=box)
+
+    def logits(self, tau: Tensor, state: Tensor) -> Tensor:
+        """What the control is the hyperbolic tangent of."""
+        return self.layers[:-1](torch.cat([tau, state], -1))
 
     def forward(self, tau: Tensor, state: Tensor) -> Tensor:
-        return self.layers(torch.cat([tau, state], -1))
+        return self.layers[-1](self.logits(tau, state))
 
 
 class Critic(nn.Module):
@@ -118,6 +132,7 @@ class Critic(nn.Module):
         root_time: whether sqrt(tau) is an input beside tau, see `RootTime`.
         output: "Sigmoid" keeps probabilities in (0, 1), as in the paper, but reaches 0 or 1 at a face only in the limit
             of infinite weights; None is linear, and meets a face as V does.
+        scaling: box of states that the first layer maps to [-1, 1]; default `problem.states`.
     """
 
     def __init__(
@@ -128,11 +143,12 @@ class Critic(nn.Module):
         action_input: bool = True,
         root_time: bool = True,
         output: Literal["Sigmoid"] | None = None,
+        scaling: Box | None = None,
     ):
         super().__init__()
         self.action_input = action_input
         controls = problem.controls.dim if action_input else 0
-        self.layers = _stack(problem, controls, hidden, 1, activation, output, root_time)
+        self.layers = _stack(problem, controls, hidden, 1, activation, output, root_time, scaling or problem.states)
         _xavier(self.layers)
 
     def inputs(self, tau: Tensor, state: Tensor, action: Tensor) -> Tensor:

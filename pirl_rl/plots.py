@@ -6,7 +6,7 @@ Figures are drawn without pyplot, so that no display and no global state is need
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -16,6 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
+from pirl_rl.evaluation import Evaluator, draw_evidence
+from pirl_rl.files import replacing
 from pirl_rl.solution import Solution
 
 TRAINING = {"train_td_loss": "TD", "train_hjb_loss": "HJB", "train_boundary_loss": "boundary"}
@@ -29,6 +31,8 @@ HELD_OUT = {
 WEIGHTS = {"td_weight": "TD", "hjb_weight": "HJB", "boundary_weight": "boundary"}
 STYLES = {"TD": "C0-", "HJB": "C1-", "boundary": "C2--", "HJB, sup over u": "C3--", "MSE of V": "C4-"}
 DPI = 150
+FIGURES = "figures"
+"""Where a run directory keeps them."""
 ERRORS = (1e-4, 1.0)
 """Colour scale of absolute errors, logarithmic: the corner would else hide all others."""
 
@@ -43,11 +47,15 @@ class Grid(NamedTuple):
     control: np.ndarray  # (controls, states, taus)
 
 
-def draw_run(solution: Solution, metrics_path: str | Path, folder: str | Path) -> list[Path]:
-    """Draw a run's figures into `folder`: training curves, and in one dimension surface, heat maps and policy.
+def draw_run(
+    solution: Solution, metrics_path: str | Path, folder: str | Path, evaluators: Iterable[Evaluator] = ()
+) -> list[Path]:
+    """Draw a run's figures into `folder`: training curves, in one dimension surface, heat maps and policy, and what the
+    evaluators measured last.
 
     Args:
         metrics_path: the run's metrics.csv; without one there are no training curves.
+        evaluators: those that have been called with the solution.
 
     Returns:
         The files written.
@@ -56,11 +64,15 @@ def draw_run(solution: Solution, metrics_path: str | Path, folder: str | Path) -
     if solution.problem.states.dim == 1:
         grid = solve_on_grid(solution)
         figures |= {"surface": draw_surface(grid), "value": draw_value(grid), "policy": draw_policy(grid, solution)}
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{name}.png" for name in figures]
+    return save_figures(figures | draw_evidence(evaluators), folder)
+
+
+def save_figures(figures: Mapping[str, Figure], folder: str | Path) -> list[Path]:
+    """Write figures as PNG files of their names; returns the files."""
+    paths = [Path(folder) / f"{name}.png" for name in figures]
     for path, figure in zip(paths, figures.values(), strict=True):
-        figure.savefig(path, dpi=DPI)
+        with replacing(path, binary=True) as file:
+            figure.savefig(file, dpi=DPI, format="png")
     return paths
 
 

@@ -9,13 +9,14 @@ x has shape (*, n), u (*, m), tau and levels (*). Nothing here knows of networks
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
 
 from pirl_rl.payoffs import Indicator, Payoff
-from pirl_rl.sets import Box
+from pirl_rl.sets import Box, Plane
 
 
 class ProblemError(ValueError):
@@ -89,6 +90,11 @@ class ReachAvoidProblem(ABC):
     def optimal_control(self, tau: Tensor, x: Tensor) -> Tensor | None:
         """An optimal u: (*), (*, n) -> (*, m), where it is known."""
         return None
+
+    @property
+    def planes(self) -> Mapping[str, Plane]:
+        """Sections of the state space to look at, by name; none by default."""
+        return {}
 
     # What the sets and the payoff say together.
 

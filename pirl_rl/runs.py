@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,19 +13,10 @@ from torch import Tensor
 from pirl_rl import checkpoint
 from pirl_rl.assembly import fitting, make_loss
 from pirl_rl.checkpoint import CheckpointError
-from pirl_rl.configuration import build, load_config
+from pirl_rl.configuration import ConfigError, build, load_config
+from pirl_rl.evaluation.trajectories import Trajectories, closed_loop
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
-
-
-@dataclass(frozen=True)
-class Trajectories:
-    """Closed-loop paths: `tau` (K + 1, N), `state` (K + 1, N, n), held after the end; `reached`, `failed` (N,) bool."""
-
-    tau: Any
-    state: Any
-    reached: Any
-    failed: Any
 
 
 class Run:
@@ -60,17 +49,9 @@ class Run:
         simulator = Simulator(self.problem, dt, substeps, crossing)  # type: ignore[arg-type]
         state, wrap = _tensor(x, self.solution)
         rng = torch.Generator(state.device).manual_seed(seed)
-        reached, failed = self.problem.reached(state), self.problem.failed(state)
-        times, states = [torch.full(state.shape[:1], float(tau)).to(state)], [state]
-        for left in range(round(tau / dt), 0, -1):
-            now = torch.full_like(times[0], left * dt)
-            step = simulator.step(state, self.solution.policy(now, state), rng)
-            active = ~(reached | failed)
-            state = torch.where(active.unsqueeze(-1), step.state, state)
-            reached, failed = reached | (active & step.reached), failed | (active & step.failed)
-            times.append(now - dt)
-            states.append(state)
-        return Trajectories(wrap(torch.stack(times)), wrap(torch.stack(states)), wrap(reached), wrap(failed))
+        times = torch.full(state.shape[:1], float(tau)).to(state)
+        paths = closed_loop(simulator, self.solution.policy, times, state, rng)
+        return Trajectories(**{name: wrap(entry) for name, entry in vars(paths).items()})
 
     def _call(self, function, tau, x):
         state, wrap = _tensor(x, self.solution)
@@ -110,3 +91,14 @@ def load_run(folder: str | Path, trust: Sequence[str] = (), weights: str = check
     with fitting(path):
         loss.load_state_dict(state.get("learner", state)["loss"])
     return Run(Solution(loss), config, int(state["update"]))
+
+
+def refuse_links(folder: Path) -> None:
+    """A foreign run directory is not to make us write elsewhere.
+
+    Raises:
+        ConfigError: naming a link that leads out of it.
+    """
+    for path in folder.rglob("*"):
+        if path.is_symlink() and not path.resolve().is_relative_to(folder.resolve()):
+            raise ConfigError(f"{path} leads out of the run directory, to {path.resolve()}")

@@ -10,9 +10,11 @@ Weights = tuple[float, float, float]
 
 
 class Schedule(Protocol):
-    """k -> (w_TD, w_HJB, w_BC)."""
+    """k -> (w_TD, w_HJB, w_BC), and how far the transition between its ends has come, in [0, 1]."""
 
-    def __call__(self, update: int) -> Weights: ...
+    def __call__(self, update: float) -> Weights: ...
+
+    def progress(self, update: float) -> float: ...
 
 
 def _weights(name: str, values: Sequence[float]) -> Weights:
@@ -30,10 +32,10 @@ class _Transition:
     def __init__(self, initial: Sequence[float], final: Sequence[float]):
         self.initial, self.final = _weights("initial", initial), _weights("final", final)
 
-    def progress(self, update: int) -> float:
+    def progress(self, update: float) -> float:
         raise NotImplementedError
 
-    def __call__(self, update: int) -> Weights:
+    def __call__(self, update: float) -> Weights:
         eta = self.progress(update)
         return tuple(a + (b - a) * eta for a, b in zip(self.initial, self.final, strict=True))  # type: ignore[return-value]
 
@@ -54,7 +56,7 @@ class LossSchedule(_Transition):
             raise ValueError(f"schedule: expected finite center and steepness > 0, got {center} and {steepness}")
         self.center, self.steepness = float(center), float(steepness)
 
-    def progress(self, update: int) -> float:
+    def progress(self, update: float) -> float:
         return (1 + math.tanh(self.steepness * (update - self.center) / 2)) / 2
 
 
@@ -67,12 +69,12 @@ class LinearSchedule(_Transition):
             raise ValueError(f"schedule: expected end > start, got start={start}, end={end}")
         self.start, self.end = float(start), float(end)
 
-    def progress(self, update: int) -> float:
+    def progress(self, update: float) -> float:
         return min(max((update - self.start) / (self.end - self.start), 0.0), 1.0)
 
 
 class ConstantSchedule(_Transition):
     """The final weights from the first update on; `initial` is there because a method sets both."""
 
-    def progress(self, update: int) -> float:
+    def progress(self, update: float) -> float:
         return 1.0

@@ -7,7 +7,8 @@ the boundary between two time steps, and contours. Levels have shape (*) where s
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -87,6 +88,23 @@ class Box:
 
     def __repr__(self) -> str:
         return f"Box({list(self.low)}, {list(self.high)})"
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A two-dimensional section of the state space, for figures and for starts of episodes.
+
+    Attributes:
+        axes: names of the two coordinates, with units.
+        box: their range.
+        embed: points of the plane (*, 2) to states (*, n).
+        project: states (*, n) to the plane's coordinates (*, 2).
+    """
+
+    axes: tuple[str, str]
+    box: Box
+    embed: Callable[[Tensor], Tensor]
+    project: Callable[[Tensor], Tensor]
 
 
 def union(*levels: Tensor) -> Tensor:

@@ -74,6 +74,8 @@ class Simulator:
             generator: source of the noise.
             dt: lengths (N,) of this step where they differ between paths; default `self.dt`.
         """
+        # Column by column in memory, as the physics reads states.
+        x = x.mT.contiguous().mT
         h = (x.new_tensor(self.dt) if dt is None else dt) / self.substeps
         reached = torch.zeros(x.shape[:-1], dtype=torch.bool, device=x.device)
         failed = reached
@@ -89,13 +91,22 @@ class Simulator:
             reached = reached | (active & now_reached & ~now_failed)
         return Step(x, reached, failed)
 
+    def flow(self, x: Tensor, u: Tensor) -> Tensor:
+        """The control step without noise and exits, (N, n) and (N, m) -> (N, n); gradients pass."""
+        for _ in range(self.substeps):
+            x = x + self.problem.drift(x, u) * (self.dt / self.substeps)
+        return x
+
     def _euler_maruyama(self, x: Tensor, u: Tensor, h: Tensor, generator) -> tuple[Tensor, Tensor]:
         sigma = self.problem.diffusion(x, u)
-        noise = (
-            torch.randn((*x.shape[:-1], 1, sigma.shape[-1]), generator=generator, dtype=x.dtype, device=x.device)
-            * torch.sqrt(h)[..., None, None]
-        )
-        return x + self.problem.drift(x, u) * h[..., None] + (sigma * noise).sum(-1), sigma
+        channels = sigma.shape[-1]
+        noise = torch.randn((channels, *x.shape[:-1]), generator=generator, dtype=x.dtype, device=x.device) * h.sqrt()
+        if all(stride == 0 for stride in sigma.stride()[:-2]):
+            # One matrix expanded to all states: a product of two matrices in place of N small ones.
+            moved = (sigma[(0,) * (sigma.ndim - 2)] @ noise).mT
+        else:
+            moved = (sigma * noise.movedim(0, -1).unsqueeze(-2)).sum(-1)
+        return x + self.problem.drift(x, u) * h[..., None] + moved, sigma
 
     def _exits(self, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor, generator) -> tuple[Tensor, Tensor]:
         problem = self.problem

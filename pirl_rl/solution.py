@@ -52,6 +52,15 @@ class Solution:
             0
         )
 
+    def gradient(self, tau: Tensor, x: Tensor) -> Tensor:
+        """grad_x of `raw_value` (N, n), the critics' action frozen at the policy."""
+        tau, x = self._own(tau, x)
+        action = self._action(tau, x).detach()
+        x = x.detach().requires_grad_()
+        with self.loss.critics("frozen") as critic:
+            value = critic.at(action)(tau, x).mean(0)
+        return torch.autograd.grad(value.sum(), x)[0]
+
     def _own(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         return tuple(tensor.to(self.dtype) for tensor in tensors)
 

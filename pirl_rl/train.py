@@ -18,7 +18,8 @@ from pirl_rl.assembly import make_trainer, restore
 from pirl_rl.configuration import CONF, ConfigError, load_config, save_config
 from pirl_rl.console import INTERRUPTED, named_modules, override, table, told
 from pirl_rl.loggers import METRICS_FILE
-from pirl_rl.plots import draw_run
+from pirl_rl.plots import FIGURES, draw_run
+from pirl_rl.runs import refuse_links
 from pirl_rl.trainer import Trainer
 
 
@@ -41,7 +42,7 @@ def resume(folder: Path, overrides: Sequence[str]) -> None:
     """Go on in a run directory, with plain `key=value` overrides of its configuration, which keeps them."""
     with told(folder):
         config = load_config(folder)
-        _refuse_links(folder)
+        refuse_links(folder)
         config.trust = []
         for text in overrides:
             override(config, text)
@@ -56,17 +57,10 @@ def _train(trainer: Trainer) -> dict[str, float]:
     folder = trainer.folder
     assert folder is not None
     print(table(summary))
-    for figure in draw_run(trainer.solution, folder / METRICS_FILE, folder / "figures"):
+    for figure in draw_run(trainer.solution, folder / METRICS_FILE, folder / FIGURES, trainer.final):
         print(f"figure   {figure}")
     print(f"run      {folder}")
     return summary
-
-
-def _refuse_links(folder: Path) -> None:
-    """A foreign run directory is not to make us write elsewhere."""
-    for path in folder.rglob("*"):
-        if path.is_symlink() and not path.resolve().is_relative_to(folder.resolve()):
-            raise ConfigError(f"{path} leads out of the run directory, to {path.resolve()}")
 
 
 @contextlib.contextmanager

@@ -19,6 +19,7 @@ from tqdm import tqdm
 from pirl_rl import checkpoint
 from pirl_rl.collectors import TransitionCollector
 from pirl_rl.collocation import BoundarySampler, Collocation
+from pirl_rl.curriculum import Curriculum
 from pirl_rl.evaluation import evaluate
 from pirl_rl.files import replacing
 from pirl_rl.learner import DivergenceError, Learner
@@ -26,7 +27,7 @@ from pirl_rl.loggers import MetricsLogger, NoLogger
 from pirl_rl.solution import Solution
 
 Evaluator = Callable[[Solution], dict[str, float]]
-EVALUATED = ("value_mse", "success_rate", "hjb_loss", "td_loss")
+EVALUATED = ("value_mse", "success_rate", "calibration_mse", "hjb_loss", "td_loss")
 TRAINED = ("train_td_loss", "train_hjb_loss", "train_boundary_loss")
 """What the progress shows, of an evaluation and between evaluations."""
 
@@ -46,6 +47,7 @@ class Trainer:
         learner: the update.
         collector: fills the replay buffer.
         collocation, boundary: samplers of the physics.
+        stages: changes of starts, collocation and actor rate over the run; the schedule of `learner` has them already.
         updates: critic updates of the whole run.
         batch_size: transitions an update.
         log_every: updates between rows of metrics.
@@ -64,6 +66,7 @@ class Trainer:
         collector: TransitionCollector,
         collocation: Collocation,
         boundary: BoundarySampler,
+        stages: Curriculum | None = None,
         updates: int = 20_000,
         batch_size: int = 256,
         log_every: int = 100,
@@ -86,6 +89,8 @@ class Trainer:
             if not (isinstance(value, int) and value >= least):
                 raise ValueError(f"trainer.{name}: expected an integer >= {least}, got {value!r}")
         self.learner, self.collector, self.collocation, self.boundary = learner, collector, collocation, boundary
+        self.stages = stages
+        self._unstaged = collector.initial_states, collocation, learner.actor_every
         self.updates, self.batch_size = updates, batch_size
         self.log_every, self.evaluate_every, self.checkpoint_every = log_every, evaluate_every, checkpoint_every
         self.during, self.final = tuple(during), tuple(final)
@@ -94,9 +99,7 @@ class Trainer:
         self.config = dict(config or {})
         self.solution = Solution(learner.loss)
         self.rng = torch.Generator(self.solution.device).manual_seed(seed)
-        # A term whose weight is zero all along the run is left out of the work.
-        weights = [learner.schedule(k) for k in (*range(0, updates, max(1, updates // 1_000)), updates)]
-        self.terms = tuple(max(values) > 0 for values in zip(*weights, strict=True))
+        self.terms = self._terms(range(updates + 1))
         self.update, self.saved, self.wall_seconds = 0, 0, 0.0
 
     def train(self) -> dict[str, float]:
@@ -111,6 +114,7 @@ class Trainer:
             self.logger.rewind(self.update)
         try:
             with _interruptible() as interrupted:
+                self._begin_stage()
                 self.collector.start()
                 self._loop(interrupted)
         except DivergenceError as error:
@@ -125,6 +129,8 @@ class Trainer:
         begin = time.perf_counter() - self.wall_seconds
         with _Progress(self.updates, self.update) as progress:
             for k in range(self.update, self.updates):
+                if self.stages is not None and self.stages.begins(k):
+                    self._begin_stage()
                 self.collector.step(k)
                 terms = self.learner.update(self.sample(), k, k / self.updates)
                 self.update, self.wall_seconds = k + 1, time.perf_counter() - begin
@@ -139,15 +145,32 @@ class Trainer:
                 if stop:
                     raise Interrupted(self.update)
 
+    def _begin_stage(self) -> None:
+        """Take over what the stage of the next update sets, and the run's own for the rest."""
+        if self.stages is None:
+            return
+        index = self.stages.index(self.update)
+        stage, (initial_states, collocation, actor_every) = self.stages.stages[index], self._unstaged
+        self.terms = self._terms(self.stages.span(index))
+        self.collector.initial_states = stage.initial_states or initial_states
+        self.collocation = stage.collocation or collocation
+        self.learner.actor_every = stage.actor_every or actor_every
+
+    def _terms(self, updates: Sequence[int]) -> tuple[bool, ...]:
+        """Which terms are worth computing: one whose weight is zero at all of these updates is not."""
+        weights = [self.learner.schedule(k) for k in (*updates[:: max(1, len(updates) // 1_000)], updates[-1])]
+        return tuple(max(values) > 0 for values in zip(*weights, strict=True))
+
     def sample(self) -> TensorDict:
         """The batch of one update."""
         td, hjb, boundary = self.terms
         replay = self.collector.buffer.sample(self.batch_size)
         parts = {"replay": replay if td else replay.exclude("next")}
         if hjb:
-            parts["collocation"] = self.collocation.sample(self.rng)
+            progress = self.learner.schedule.progress(self.update)
+            parts["collocation"] = self.collocation.sample(self.rng, replay, progress)
         if boundary:
-            parts["boundary"] = self.boundary.sample(self.rng)
+            parts["boundary"] = self.boundary.sample(self.rng, replay)
         return TensorDict(parts).to(self.solution.device)
 
     def _row(self, k: int, terms: Mapping[str, torch.Tensor]) -> dict[str, float]:
@@ -155,7 +178,8 @@ class Trainer:
         evaluates = bool(self.evaluate_every) and (k == 0 or self.update % self.evaluate_every == 0)
         if not (k == 0 or evaluates or self.update % self.log_every == 0):
             return {}
-        row = {"update": self.update, **self.learner.weights_and_rate(k, k / self.updates)}
+        stage = {} if self.stages is None else {"stage": self.stages.index(k)}
+        row = {"update": self.update, **stage, **self.learner.weights_and_rate(k, k / self.updates)}
         for name in ("td_loss", "hjb_loss", "boundary_loss", "loss_actor"):
             value = terms[name].item() if name in terms else math.nan
             row[name if name.startswith("loss") else f"train_{name}"] = value

@@ -5,10 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 from oracles import PROBLEMS, Corner, name
+from tensordict import TensorDict
 
-from pirl_rl.collocation import BoundarySampler, Collocation
+from pirl_rl.collocation import BoundarySampler, Collocation, ReplayCollocation
 from pirl_rl.problem import ProblemError
-from pirl_rl.problems import Reach1D, Safety1D
+from pirl_rl.problems import Reach1D, Safety1D, VehicleDrift
 from pirl_rl.sets import Box
 
 SAMPLERS = pytest.mark.parametrize("sampler", ["uniform", "sobol"])
@@ -28,7 +29,7 @@ def test_interior_points_lie_in_the_box_and_are_masked_where_the_equation_does_n
     assert (tau > 0).all()
     assert (tau <= problem.horizon).all()
     assert problem.states.expand(1.5 + 1e-5).contains(x).all()
-    assert torch.equal(mask, ~(problem.reached(x) | problem.failed(x)))
+    assert torch.equal(mask, ~(problem.reached(x) | problem.failed(x) | problem.unreachable(x)))
     assert 0 < mask.sum() < 3_000
 
 
@@ -173,3 +174,65 @@ def test_errors_name_the_key(make, message):
 
 def test_expanded_box_of_the_sampler():
     assert Collocation(Reach1D(), widen=1.5).box == Box([-3.0], [3.0])
+
+
+def visited(problem, count=500):
+    """Transitions at states outside the sets, at most of the horizon to go."""
+    generator = rng(3)
+    tau = problem.horizon * (0.5 + 0.4 * torch.rand(count, 1, generator=generator))
+    x = problem.states.sample(4 * count, generator)
+    x = x[problem.interior(x) & ~problem.unreachable(x)][:count]
+    return TensorDict({"tau": tau[: len(x)], "state": x}, batch_size=[len(x)])
+
+
+def normalised(problem, points):
+    return torch.cat([2 * points["tau"] / problem.horizon - 1, problem.states.normalize(points["state"])], -1)
+
+
+@pytest.mark.parametrize("progress", [0.0, 0.5, 1.0])
+def test_points_near_visited_ones_move_with_the_schedule(progress):
+    """Share and jitter by the distance to the nearest visited point: 8 normal steps of a deviation have the chi law."""
+    problem = VehicleDrift()
+    replay, size = visited(problem), 4_000
+    sampler = ReplayCollocation(problem, size, replay_share=(0.9, 0.5), jitter=(0.01, 0.03))
+    points = sampler.sample(rng(), replay, progress)
+    nearest = torch.cdist(normalised(problem, points), normalised(problem, replay)).amin(1)
+    share, jitter = 0.9 - 0.4 * progress, 0.01 + 0.02 * progress
+    # Beyond 6 deviations lies 1e-4 of the chi law with 8 degrees of freedom; uniform points are hardly ever that near.
+    near = nearest < 6 * jitter
+    assert near.double().mean().item() == pytest.approx(share, abs=0.03)
+    assert nearest[near].square().mean().sqrt().item() == pytest.approx(8**0.5 * jitter, rel=0.05)
+    assert torch.equal(points["mask"], sampler.mask(points["tau"], points["state"]))
+
+
+def test_without_a_replay_all_points_are_uniform():
+    problem = Reach1D()
+    assert_equal_points(ReplayCollocation(problem, 50).sample(rng()), Collocation(problem, 50).sample(rng()))
+
+
+def assert_equal_points(ours, theirs):
+    for key in theirs.keys():
+        assert torch.equal(ours[key], theirs[key])
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"replay_share": (0.5, 1.5)}, r"collocation.replay_share: expected \[start, end\] from 0 to 1, got"),
+        ({"jitter": (-0.1, 0.1)}, "collocation.jitter: expected"),
+        ({"jitter": (0.1,)}, "collocation.jitter: expected"),
+    ],
+)
+def test_replay_collocation_names_the_key(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        ReplayCollocation(VehicleDrift(), **kwargs)
+
+
+def test_visited_states_take_their_share_of_the_points_at_the_end_of_time():
+    problem = VehicleDrift()
+    replay = visited(problem)
+    points = BoundarySampler(problem, initial=200, faces=50, replay_share=0.25).sample(rng(), replay)
+    assert (points["tau"][:200] == 0).all()
+    known = (points["state"].unsqueeze(1) == replay["state"]).all(-1).any(-1)
+    assert known.tolist() == [True] * 50 + [False] * 200
+    assert torch.equal(points["value"][:200], problem.boundary_value(points["state"][:200]))

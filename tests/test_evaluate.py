@@ -9,6 +9,8 @@ from small import small_trainer
 
 from pirl_rl import evaluate
 
+FIGURES = {"training.png", "surface.png", "value.png", "policy.png"}
+
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
@@ -22,7 +24,10 @@ def test_repeats_the_summary(run, capsys):
     results = json.loads((folder / "evaluation.json").read_text())
     assert results == {name: summary[name] for name in results}
     assert "value_mse" in results
-    assert "value_mse" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "value_mse" in printed
+    assert {path.name for path in (folder / "figures").iterdir()} == FIGURES
+    assert all(name in printed for name in FIGURES)
 
 
 def test_takes_other_samples(run):
@@ -32,6 +37,17 @@ def test_takes_other_samples(run):
     width, before = (entry["success_high"] - entry["success_low"] for entry in (results, summary))
     assert "value_mse" not in results
     assert width < before / 2  # 2,000 episodes against the debug configuration's 64
+
+
+def test_draws_nowhere_else(run, tmp_path, capsys):
+    """A link in a directory from elsewhere is not followed."""
+    folder = run[0]
+    link = folder / "extra"
+    link.symlink_to(tmp_path)
+    with pytest.raises(SystemExit):
+        evaluate.main([f"run={folder}"])
+    link.unlink()
+    assert "leads out of the run directory" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

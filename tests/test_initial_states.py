@@ -6,9 +6,9 @@ import pytest
 import torch
 from oracles import PROBLEMS, name
 
-from pirl_rl.initial_states import UniformStates, sample_interior
+from pirl_rl.initial_states import EquilibriumStates, UniformStates, VisitedStates, sample_interior
 from pirl_rl.problem import ProblemError
-from pirl_rl.problems import Reach1D, Safety1D
+from pirl_rl.problems import Reach1D, Safety1D, VehicleDrift
 from pirl_rl.sets import Box
 
 COUNT = 20_000
@@ -50,7 +50,7 @@ def test_same_generator_same_states():
 
 
 def test_a_box_inside_the_target_is_refused():
-    with pytest.raises(ProblemError, match=r"Reach1D: no state outside .* found in Box\(\[3.0\], \[4.0\]\)"):
+    with pytest.raises(ProblemError, match="Reach1D: no initial state outside"):
         sample_interior(Reach1D(), Box([3.0], [4.0]), 5, torch.Generator(), torch.float32)
 
 
@@ -65,3 +65,90 @@ def test_a_box_inside_the_target_is_refused():
 def test_errors_name_the_key(kwargs, message):
     with pytest.raises(ValueError, match=message):
         UniformStates(**kwargs)
+
+
+def around(scale, mixture, tau="random", count=COUNT):
+    law = EquilibriumStates(scale, mixture, tau)
+    return law.sample(VehicleDrift(), count, 50, torch.Generator().manual_seed(0), torch.float64)
+
+
+@pytest.mark.parametrize(("kind", "columns"), [(0, {3, 4}), (1, {0, 1}), (2, {0, 1, 3, 4})])
+def test_drift_starts_are_displaced_in_their_plane_only(kind, columns):
+    problem = VehicleDrift()
+    mixture = [0.0, 0.0, 0.0]
+    mixture[kind] = 1.0
+    _, x = around(1.0, mixture)
+    moved = (x - problem.around_equilibrium(x[:, 6])).abs().amax(0)
+    assert {i for i in range(7) if moved[i] > 1e-9} == columns
+    assert problem.interior(x).all()
+    assert not problem.unreachable(x).any()
+
+
+def test_the_scale_contracts_towards_the_equilibrium():
+    """Half of the scale: half of the box around the equilibrium of the state's own friction, filled to its ends."""
+    problem = VehicleDrift()
+    _, x = around(0.5, (0, 1, 0))
+    middle = problem.around_equilibrium(x[:, 6])
+    e_y, e_psi = x[:, 0], (x - middle)[:, 1]
+    box = problem.planes["e_y_e_psi"].box
+    low, high = (0.5 * (end - middle[:, 1]) for end in (box.low[1], box.high[1]))
+    assert (e_psi >= low - 1e-12).all()
+    assert (e_psi <= high + 1e-12).all()
+    assert e_y.abs().max().item() == pytest.approx(1.0, abs=1e-2)
+    assert x[:, 6].min().item() == pytest.approx(0.5, abs=1e-3)
+    assert x[:, 6].max().item() == pytest.approx(0.6, abs=1e-3)
+
+
+def test_a_range_of_scales_fills_the_middle_more():
+    near = [(around(scale, (0, 1, 0))[1][:, 0].abs() < 0.5).double().mean().item() for scale in (1.0, [0.0, 1.0])]
+    # |e_y| = 2 S U, S = 1 or uniform too: P(< 1/2) = 1/4, or 1/4 (1 + log 4) = 0.6 less starts inside the target.
+    assert near[0] == pytest.approx(0.25, abs=0.03)
+    assert 0.45 < near[1] < 0.6
+
+
+def test_the_mixture_has_its_shares():
+    _, x = around(1.0, (0.3, 0.3, 0.4))
+    moved = (x - VehicleDrift().around_equilibrium(x[:, 6])).abs() > 1e-9
+    # States redrawn out of the avoid set shift the shares a little.
+    assert (moved[:, 0] & ~moved[:, 4]).double().mean().item() == pytest.approx(0.3, abs=0.02)
+    assert (moved[:, 4] & ~moved[:, 0]).double().mean().item() == pytest.approx(0.3, abs=0.02)
+
+
+def test_visited_states_are_moved_by_at_most_the_radius():
+    problem, generator = VehicleDrift(), torch.Generator().manual_seed(0)
+    others = EquilibriumStates(1.0)
+    visited = others.sample(problem, 4, 50, generator, torch.float64)[1]
+    _, x = VisitedStates(others, 1.0, 0.2).sample(problem, COUNT, 50, generator, torch.float64, visited)
+    box = problem.states
+    distance = (box.normalize(x).unsqueeze(1) - box.normalize(visited)).norm(dim=-1).amin(1)
+    near = distance <= 0.2 + 1e-9
+    # The rest left the band of friction or fell into a set, and was replaced.
+    assert near.double().mean() > 0.7
+    assert distance[near].max() > 0.19
+    assert problem.interior(x).all()
+    assert not problem.unreachable(x).any()
+
+
+def test_visited_states_take_their_share():
+    problem, generator = VehicleDrift(), torch.Generator().manual_seed(0)
+    law = VisitedStates(EquilibriumStates(1.0), 0.25, 0.0)
+    visited = problem.around_equilibrium(torch.tensor([0.55]), e_y=torch.tensor([1.0]))
+    _, x = law.sample(problem, COUNT, 50, generator, torch.float32, visited)
+    assert (x - visited).abs().amax(-1).lt(1e-5).double().mean().item() == pytest.approx(0.25, abs=0.02)
+    none = law.sample(problem, 100, 50, generator, torch.float32)[1]
+    assert not (none - visited).abs().amax(-1).lt(1e-5).any()
+
+
+@pytest.mark.parametrize(
+    ("law", "message"),
+    [
+        (lambda: EquilibriumStates(2.0), "initial_states.scale"),
+        (lambda: EquilibriumStates([0.5, 0.2]), "initial_states.scale"),
+        (lambda: EquilibriumStates(1.0, (1, 0)), "initial_states.mixture: expected three shares"),
+        (lambda: EquilibriumStates(tau="late"), "initial_states.tau"),
+        (lambda: VisitedStates(UniformStates(), 1.5), "0 <= share <= 1"),
+    ],
+)
+def test_drift_laws_name_the_key(law, message):
+    with pytest.raises(ValueError, match=message):
+        law()

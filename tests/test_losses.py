@@ -8,13 +8,16 @@ import shutil
 import pytest
 import torch
 from oracles import PROBLEMS, FullNoise, make_batch, name, nested_generator, points
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives import TD3Loss
 
 from pirl_rl.losses import WEIGHTS, PIRLLoss
 from pirl_rl.networks import Actor, Critic
-from pirl_rl.problems import Reach1D
+from pirl_rl.operators import advection
+from pirl_rl.problems import Reach1D, VehicleDrift
+from pirl_rl.simulator import Simulator
 
 RELATIVE = 1e-10
 some_problems = pytest.mark.parametrize("problem", [Reach1D(), FullNoise(8, 2, 3)], ids=name)
@@ -274,7 +277,7 @@ def test_a_sigmoid_keeps_probabilities_and_a_linear_output_does_not():
 def test_critics_of_v_refuse_an_actor_that_ascends_q(rule):
     problem = Reach1D()
     nets = [Critic(problem, (4,)), Critic(problem, (4,), action_input=False)]
-    with pytest.raises(ValueError, match=f"actor_rule: critics without the action need 'hamiltonian', got '{rule}'"):
+    with pytest.raises(ValueError, match=f"need 'hamiltonian' or 'model', got '{rule}'"):
         PIRLLoss(problem, Actor(problem), nets, actor_rule=rule)
     PIRLLoss(problem, Actor(problem), nets[1:], actor_rule="hamiltonian")
 
@@ -313,8 +316,122 @@ def test_both_is_the_sum_of_the_rules():
     assert_close(both, [a + b for a, b in zip(q, hamiltonian, strict=True)])
 
 
+@pytest.mark.usefixtures("float64")
+@pytest.mark.parametrize("problem", [Reach1D(), VehicleDrift()], ids=name)
+@pytest.mark.parametrize("steps", [1, 3])
+def test_look_ahead_by_hand(problem, steps):
+    """Each state alone: Euler steps under the actor until the path meets a set or time is up, then the mean of the
+    critics there, 1 in the target."""
+    simulator = Simulator(problem, problem.horizon / 10, 4, "endpoint")
+    loss = make_loss(problem, actor_rule="model", model_steps=steps, simulator=simulator)
+    batch, dt = make_batch(problem), simulator.dt
+    replay = batch["replay"]
+    replay["tau"] = dt * torch.arange(len(replay), dtype=torch.float64).remainder(10).unsqueeze(-1)
+    actor, critics = networks(problem)
+    loss.actor_network_params.data.copy_(TensorDict.from_module(TensorDictModule(actor, ["tau"], ["action"])).data)
+    total, ended = 0.0, set()
+    for tau, x in zip(replay["tau"], replay["state"], strict=True):
+        for _ in range(steps):
+            if tau < dt / 2 or not problem.interior(x):
+                ended.add("time" if tau < dt / 2 else "set")
+                break
+            u = problem.controls.denormalize(actor(tau.unsqueeze(0), x.unsqueeze(0)))[0]
+            for _ in range(4):
+                x = x + problem.drift(x, u) * dt / 4
+            tau = tau - dt
+        inputs = tau.unsqueeze(0), x.unsqueeze(0), actor(tau.unsqueeze(0), x.unsqueeze(0)).detach()
+        values = [critic(*inputs).squeeze() for critic in critics]
+        total = total + (torch.ones(()) if problem.reached(x) else sum(values) / 2)
+    expected = -total / len(replay)
+    ours = loss.actor_loss(batch)[0]
+    assert "set" in ended or problem.states.dim == 1
+    assert "time" in ended
+    assert_close([ours], [expected])
+    assert_close(gradients(ours, loss.actor_network_params), torch.autograd.grad(expected, list(actor.parameters())))
+    assert_no_gradient_for_critics(loss, batch)
+
+
+def assert_no_gradient_for_critics(loss, batch):
+    loss.zero_grad()
+    loss.actor_loss(batch)[0].backward()
+    assert all(entry.grad is None for entry in loss.qvalue_network_params.parameters())
+
+
+@pytest.mark.usefixtures("float64")
+def test_look_ahead_follows_the_hamiltonian_as_the_step_shrinks():
+    """(V(x_dt) - V(x)) / dt has the gradient of f . grad V in the actor's parameters, to first order in dt."""
+    problem, batch = FullNoise(3, 2, 2), make_batch(FullNoise(3, 2, 2), 8)
+    batch["replay", "tau"] = torch.full_like(batch["replay", "tau"], 1.0)
+    kept = batch["replay"][problem.interior(batch["replay", "state"])]
+
+    def slope(dt):
+        simulator = Simulator(problem, dt, 1, "endpoint")
+        # Critics of V: Q's own dependence on it is no part of either.
+        loss = PIRLLoss(problem, *v_networks(problem), actor_rule="model", simulator=simulator)
+        value = loss.actor_loss(TensorDict({"replay": kept}))[0]
+        return torch.cat([entry.flatten() / dt for entry in gradients(value, loss.actor_network_params)])
+
+    loss = PIRLLoss(problem, *v_networks(problem), actor_rule="hamiltonian")
+    loss._hamiltonian_operator = advection
+    limit = loss.actor_loss(TensorDict({"replay": kept}))[0]
+    exact = torch.cat([entry.flatten() for entry in gradients(limit, loss.actor_network_params)])
+    errors = [((slope(dt) - exact).norm() / exact.norm()).item() for dt in (1e-2, 1e-3)]
+    assert errors[0] < 0.1
+    assert errors[1] == pytest.approx(errors[0] / 10, rel=0.2)
+
+
+def v_networks(problem):
+    torch.manual_seed(3)
+    return Actor(problem, (8, 8), "Tanh"), [Critic(problem, (9, 7), action_input=False) for _ in range(2)]
+
+
+@pytest.mark.usefixtures("float64")
+@some_problems
+def test_logit_penalty_by_hand(problem):
+    plain, batch = make_loss(problem, actor_rule="q"), make_batch(problem)
+    ours = make_loss(problem, actor_rule="q", logit_penalty=0.3)
+    action = plain.act(batch["replay", "tau"], batch["replay", "state"])
+    expected = plain.actor_loss(batch)[0] + 0.3 * action.atanh().square().mean()
+    assert_close([ours.actor_loss(batch)[0]], [expected])
+
+
+@pytest.mark.usefixtures("float64")
+@some_problems
+def test_cross_entropy_and_mean_target_by_hand(problem):
+    torch.manual_seed(3)
+    nets = [Critic(problem, (9, 7), output="Sigmoid") for _ in range(2)]
+    kwargs = {"policy_noise": 0.0, "td_criterion": "cross_entropy", "target_critics": "mean"}
+    loss, batch = PIRLLoss(problem, Actor(problem, (8,), "Tanh"), nets, **kwargs), make_batch(problem)
+    replay = batch["replay"]
+    following = replay["next"]
+    values = [net(following["tau"], following["state"], loss.act(following["tau"], following["state"])) for net in nets]
+    # Payoffs and their mean stay probabilities: one of the two ends a path.
+    following["reward"] = following["reward"] * following["terminated"]
+    target = (following["reward"] + ~following["terminated"] * (values[0] + values[1]) / 2).detach()
+    expected = 0.0
+    for net in nets:
+        p = net(replay["tau"], replay["state"], replay["action"])
+        expected = expected - (target * p.log() + (1 - target) * (1 - p).log()).mean()
+    assert_close([loss.critic_loss(batch)[1]["td_loss"]], [expected.detach()])
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"td_criterion": "absolute"}, "td_criterion: expected one of squares, cross_entropy, got 'absolute'"),
+        ({"td_criterion": "cross_entropy"}, "needs critics with output 'Sigmoid'"),
+        ({"target_critics": "max"}, "target_critics: expected 'min' or 'mean', got 'max'"),
+        ({"actor_rule": "model"}, "loss.simulator: expected a simulator"),
+        ({"model_steps": 0}, "model_steps: expected at least 1, got 0"),
+    ],
+)
+def test_wrong_arguments_are_named(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        make_loss(Reach1D(), **kwargs)
+
+
 def test_an_unknown_rule_is_named():
-    with pytest.raises(ValueError, match=r"actor_rule: expected 'q', 'hamiltonian' or 'both', got 'ppo'"):
+    with pytest.raises(ValueError, match=r"actor_rule: expected 'q', 'hamiltonian', 'both' or 'model', got 'ppo'"):
         make_loss(Reach1D(), actor_rule="ppo")
 
 

@@ -23,6 +23,13 @@ def sample(problem: ReachAvoidProblem, count: int = 2_000) -> Tensor:
     return problem.states.expand(1.5).sample(count, torch.Generator().manual_seed(0), torch.float64)
 
 
+def sample_planes(problem: ReachAvoidProblem) -> Tensor:
+    """Points of the problem's planes, where a target too thin for `sample` is found."""
+    generator = torch.Generator().manual_seed(1)
+    planes = [plane.embed(plane.box.sample(1_000, generator, torch.float64)) for plane in problem.planes.values()]
+    return torch.cat([torch.empty(0, problem.states.dim, dtype=torch.float64), *planes])
+
+
 @pytest.mark.parametrize("problem", PROBLEMS, ids=name)
 def test_problems_do_not_contradict_themselves(problem):
     check_problem(problem)
@@ -35,7 +42,7 @@ def test_controlled_noise_is_found(problem):
 
 @pytest.mark.parametrize("problem", [*PROBLEMS, Corner()], ids=name)
 def test_sets_and_boundary_values_agree(problem):
-    x = sample(problem)
+    x = torch.cat([sample(problem), sample_planes(problem)])
     reached, failed, interior = problem.reached(x), problem.failed(x), problem.interior(x)
     assert torch.equal(interior, ~reached & ~failed)
     assert interior.any()

@@ -63,15 +63,21 @@ def only_run(folder: Path) -> Path:
     return run
 
 
-@pytest.mark.parametrize("experiment", names("experiment"))
+# The paper's TD3 baselines differ from drift_paper in their stages only, and start worker processes for each.
+EXPERIMENTS = [
+    pytest.param(name, marks=[pytest.mark.slow] * name.startswith("drift_td3")) for name in names("experiment")
+]
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_every_experiment_trains(experiment, cli, tmp_path, monkeypatch):
-    own = []
+    own = ["+debug=drift"] if experiment.startswith("drift") else ["+debug=default", *SMALL]
     if experiment == "own":
         (tmp_path / "my_module.py").write_text(OWN.replace("OFFSET", "1.5"))
         sys.modules.pop("my_module", None)
         monkeypatch.syspath_prepend(tmp_path)
-        own = ["env.problem._target_=my_module.MyProblem"]
-    code, text = cli(f"+experiment={experiment}", "+debug=default", *SMALL, *own)
+        own.append("env.problem._target_=my_module.MyProblem")
+    code, text = cli(f"+experiment={experiment}", *own)
     assert code == 0, text
     run = only_run(tmp_path)
     summary = json.loads((run / "summary.json").read_text())

@@ -14,6 +14,7 @@ from torchrl.data import TensorDictReplayBuffer
 
 from pirl_rl.collectors.multi_async import CollectorError, MultiAsyncCollector
 from pirl_rl.collectors.sync import SyncCollector
+from pirl_rl.initial_states import InitialStates
 
 __all__ = ["CollectorError", "MultiAsyncCollector", "SyncCollector", "TransitionCollector"]
 
@@ -24,6 +25,7 @@ class TransitionCollector(Protocol):
     """What the trainer asks of a collector; a state is loaded before `start`."""
 
     buffer: TensorDictReplayBuffer
+    initial_states: InitialStates  # a stage of a curriculum sets another one
 
     def start(self) -> None:
         """Fill the buffer to its warm-up."""

@@ -19,6 +19,7 @@ from torchrl.weight_update import SharedMemWeightSyncScheme
 from pirl_rl.collectors.buffers import buffer_state, check_sizes, load_buffer, make_buffer
 from pirl_rl.collectors.transitions import Exploration, Transitions, exploring_policy
 from pirl_rl.envs import ReachAvoidEnv
+from pirl_rl.initial_states import InitialStates
 from pirl_rl.networks import Actor
 
 
@@ -59,20 +60,39 @@ class MultiAsyncCollector:
             raise ValueError(f"collector.workers: expected at least 1, got {workers}")
         self.updates_per_batch, self.warmup_frames, self.patience = updates_per_batch, warmup_frames, patience
         self.buffer, self._rng = make_buffer(buffer_size, torch.device("cpu"), seed, shared=True)
-        self._actor, self._copy, self._seed = actor, copy.deepcopy(actor).cpu(), seed
-        recipes = [env.recipe(seed=seed + 1 + index) for index in range(workers)]
-        self._envs = [partial(_worker_env, recipe, os.getpid()) for recipe in recipes]
-        self._policy = exploring_policy(self._copy, Exploration(exploration_noise, exploration))
+        self._actor, self._seed, self._exploration = actor, seed, Exploration(exploration_noise, exploration)
+        self._env, self._workers = env, workers
         self._frames_per_batch, self._transitions = frames_per_batch, Transitions(n_steps)
         self._collector: Any = None
         storage: Any = self.buffer.storage
         weakref.finalize(self, shutil.rmtree, storage.scratch_dir, ignore_errors=True)
         self._delivered, self._delivered_at = 0, 0.0
 
+    @property
+    def initial_states(self) -> InitialStates:
+        """The law of episodes' starts; setting another one starts the workers anew."""
+        return self._env.initial_states
+
+    @initial_states.setter
+    def initial_states(self, law: InitialStates) -> None:
+        if law is self._env.initial_states:
+            return
+        self._env.initial_states = law
+        if self._collector is not None:
+            self.close()
+            self.start()
+
     def start(self) -> None:
+        # A start in the middle of a run is not to repeat the noise of the one before.
+        seeds = range(first := self._seed + 1 + self.buffer.write_count, first + self._workers)
+        recipes = [self._env.recipe(seed) for seed in seeds]
+        self._copy = copy.deepcopy(self._actor).cpu()
+        self._policy = exploring_policy(self._copy, self._exploration)
+        # A generator's state does not survive the way into a spawned process.
+        self.buffer.set_rng(None)
         try:
             self._collector = torchrl_collectors.MultiAsyncCollector(
-                self._envs,
+                [partial(_worker_env, recipe, os.getpid()) for recipe in recipes],
                 self._policy,
                 frames_per_batch=self._frames_per_batch,
                 total_frames=-1,
@@ -84,7 +104,6 @@ class MultiAsyncCollector:
             )
         except RuntimeError as error:
             raise CollectorError(f"rollout workers did not start, see their messages above: {error}") from None
-        # Only now: a generator's state does not survive the way into a spawned process.
         self.buffer.set_rng(self._rng)
         self._collector.set_seed(self._seed)
         self._collector.start()

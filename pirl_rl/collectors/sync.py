@@ -10,6 +10,7 @@ from torchrl.collectors import Collector
 from pirl_rl.collectors.buffers import buffer_state, check_sizes, load_buffer, make_buffer
 from pirl_rl.collectors.transitions import Exploration, Transitions, exploring_policy
 from pirl_rl.envs import ReachAvoidEnv
+from pirl_rl.initial_states import InitialStates
 from pirl_rl.networks import Actor
 
 
@@ -56,6 +57,15 @@ class SyncCollector:
         )
         self._batches = iter(self._collector)
         self._transitions = Transitions(n_steps)
+
+    @property
+    def initial_states(self) -> InitialStates:
+        """The law of the next episodes' starts."""
+        return self.env.initial_states
+
+    @initial_states.setter
+    def initial_states(self, law: InitialStates) -> None:
+        self.env.initial_states = law
 
     def start(self) -> None:
         while len(self.buffer) < min(self.warmup_frames, self.buffer.storage.max_size):

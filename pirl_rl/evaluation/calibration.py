@@ -8,14 +8,14 @@ from typing import Literal
 import torch
 
 from pirl_rl.evaluation.monte_carlo import mean_payoff
-from pirl_rl.initial_states import sample_interior
+from pirl_rl.initial_states import InitialStates, UniformStates
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
 
 class Calibration:
-    """V (masked) against the mean payoff of noise-free rollouts, at states uniform in the box outside A and B and
-    tau uniform in (0, T]: the same points and noise at every call.
+    """V (masked) against the mean payoff of noise-free rollouts, at states uniform in the box outside A and B, or of a
+    law of starts, and tau uniform in (0, T]: the same points and noise at every call.
 
     Args:
         points: states.
@@ -23,6 +23,7 @@ class Calibration:
         dt: control step, s.
         substeps: integration steps in it.
         crossing: how exits are watched.
+        initial_states: the law of the states; its steps to go are not used.
         seed: of points and noise.
     """
 
@@ -33,17 +34,20 @@ class Calibration:
         dt: float = 0.1,
         substeps: int = 1,
         crossing: Literal["bridge", "endpoint"] = "bridge",
+        initial_states: InitialStates | None = None,
         seed: int = 0,
     ):
         if points < 1 or rollouts < 2:
             raise ValueError(f"Calibration: expected points >= 1 and rollouts >= 2, got {points} and {rollouts}")
         self.points, self.rollouts, self.seed = points, rollouts, seed
+        self.initial_states = initial_states or UniformStates()
         self.simulator = partial(Simulator, dt=dt, substeps=substeps, crossing=crossing)
 
     def __call__(self, solution: Solution) -> dict[str, float]:
         """calibration_mse, calibration_mae, and calibration_noise, the part of the former that is Monte Carlo's own."""
         problem, generator = solution.problem, torch.Generator().manual_seed(self.seed)
-        x = sample_interior(problem, problem.states, self.points, generator, solution.dtype).to(solution.device)
+        _, x = self.initial_states.sample(problem, self.points, 1, generator, solution.dtype)
+        x = x.to(solution.device)
         late = 1 - torch.rand(self.points, generator=generator, dtype=solution.dtype)
         tau = problem.horizon * late.to(solution.device)
         noise = torch.Generator(solution.device).manual_seed(self.seed)

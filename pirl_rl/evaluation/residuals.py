@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Literal
 
@@ -9,6 +10,8 @@ import torch
 from torch import Tensor
 
 from pirl_rl.collocation import BoundarySampler, Collocation
+from pirl_rl.evaluation.evidence import like
+from pirl_rl.evaluation.reference_states import ReferenceStates
 from pirl_rl.initial_states import UniformStates
 from pirl_rl.simulator import Simulator, exit_value
 from pirl_rl.solution import Solution
@@ -20,12 +23,15 @@ class Residuals:
     - hjb_loss: (L^pi V)^2 at Sobol points of (0, T] x states outside A and B. A wrong policy can satisfy it.
     - hjb_sup_loss: (max_u L^u V)^2 at the same points, the HJB equation itself, Eq. (hjb_pde): exposes a reversed
       policy. The maximum is over a grid of controls and the policy's own.
+    - value_slope: mean |grad V| at the same points, in the coordinates in which `problem.states` is [-1, 1]^n: a value
+      that has collapsed to a constant satisfies the equation too.
     - boundary_loss: (V - l_eps)^2, half of the points at tau = 0, half on the faces of A and B.
     - td_loss: (V(y) - r - (1 - d) V(y'))^2 of one control step from x uniform and whole steps to go. The noise of the
       step leaves the variance of V(y'), about |sigma^T grad V|^2 dt, even to the exact value.
 
     Args:
         points: of each of the samples.
+        states: gives reference states in place of the Sobol points, where most of the box is never visited.
         controls_per_axis: grid of the maximum, vertices included: this to the power m evaluations.
         dt: control step of the transitions, s.
         substeps: integration steps in it.
@@ -36,6 +42,7 @@ class Residuals:
     def __init__(
         self,
         points: int = 4096,
+        states: Callable[[], ReferenceStates] | None = None,
         controls_per_axis: int = 5,
         dt: float = 0.1,
         substeps: int = 1,
@@ -44,23 +51,35 @@ class Residuals:
     ):
         if points < 2 or controls_per_axis < 2:
             raise ValueError(f"Residuals: expected points, controls_per_axis >= 2, got {points}, {controls_per_axis}")
-        self.points, self.controls_per_axis, self.seed = points, controls_per_axis, seed
+        self.points, self.states, self.controls_per_axis, self.seed = points, states, controls_per_axis, seed
         self.simulator = partial(Simulator, dt=dt, substeps=substeps, crossing=crossing)
 
     def __call__(self, solution: Solution) -> dict[str, float]:
         generator = torch.Generator().manual_seed(self.seed)
-        along, largest = self._hjb(solution, generator)
+        tau, x = self._interior(solution, generator)
+        along, largest = self._hjb(solution, tau, x)
         losses = {
             "hjb_loss": along,
             "hjb_sup_loss": largest,
             "boundary_loss": self._boundary(solution, generator),
             "td_loss": self._td(solution, generator),
         }
-        return {name: residual.square().mean().item() for name, residual in losses.items()}
+        slope = solution.gradient(tau, x) * solution.problem.states.center_and_half_width(x)[1]
+        squares = {name: residual.square().mean().item() for name, residual in losses.items()}
+        return {**squares, "value_slope": slope.norm(dim=-1).mean().item()}
 
-    def _hjb(self, solution: Solution, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        points = Collocation(solution.problem, self.points, sampler="sobol").sample(generator)
-        tau, x = _like(solution, points["tau"].squeeze(-1)[points["mask"]], points["state"][points["mask"]])
+    def _interior(self, solution: Solution, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        collocation = Collocation(solution.problem, self.points, sampler="sobol")
+        if self.states is None:
+            points = collocation.sample(generator)
+            tau, x, mask = points["tau"], points["state"], points["mask"]
+        else:
+            states = self.states()
+            tau, x = states.tau.unsqueeze(-1), states.x
+            mask = collocation.mask(tau, x)
+        return like(solution, tau.squeeze(-1)[mask], x[mask])  # type: ignore[return-value]
+
+    def _hjb(self, solution: Solution, tau: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         along = largest = solution.residual(tau, x)
         axis = torch.linspace(-1, 1, self.controls_per_axis).to(tau)
         for action in torch.cartesian_prod(*[axis] * solution.problem.controls.dim).view(
@@ -73,20 +92,16 @@ class Residuals:
     def _boundary(self, solution: Solution, generator: torch.Generator) -> Tensor:
         half = self.points // 2
         points = BoundarySampler(solution.problem, initial=self.points - half, faces=half).sample(generator)
-        tau, x, value = _like(solution, points["tau"].squeeze(-1), points["state"], points["value"])
+        tau, x, value = like(solution, points["tau"].squeeze(-1), points["state"], points["value"])
         return solution.raw_value(tau, x) - value
 
     def _td(self, solution: Solution, generator: torch.Generator) -> Tensor:
         problem, simulator = solution.problem, self.simulator(solution.problem)
         max_steps = round(problem.horizon / simulator.dt)
         steps, x = UniformStates().sample(problem, self.points, max_steps, generator, solution.dtype)
-        tau, tau_next, x = _like(solution, steps * simulator.dt, (steps - 1) * simulator.dt, x)
+        tau, tau_next, x = like(solution, steps * simulator.dt, (steps - 1) * simulator.dt, x)
         noise = torch.Generator(solution.device).manual_seed(self.seed)
         step = simulator.step(x, solution.policy(tau, x), noise)
         ended = step.reached | step.failed | (steps == 1).to(solution.device)
         target = torch.where(ended, exit_value(problem, step), solution.raw_value(tau_next, step.state))
         return solution.raw_value(tau, x) - target
-
-
-def _like(solution: Solution, *tensors: Tensor) -> tuple[Tensor, ...]:
-    return tuple(tensor.to(solution.device, solution.dtype) for tensor in tensors)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pirl_rl.evaluation.monte_carlo import Policy, mean_payoff, wilson_interval
-from pirl_rl.initial_states import UniformStates
+from pirl_rl.initial_states import InitialStates, UniformStates
 from pirl_rl.payoffs import Indicator
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
@@ -35,7 +35,7 @@ class Success:
         dt: float = 0.1,
         substeps: int = 1,
         crossing: Literal["bridge", "endpoint"] = "bridge",
-        initial_states: UniformStates | None = None,
+        initial_states: InitialStates | None = None,
         seed: int = 0,
     ):
         if episodes < 1:

@@ -1,0 +1,204 @@
+"""The paper's drifting networks and ours, measured alike.
+
+    python benchmarks/drift_baselines.py --weights DIR RUN_DIR ... --out FOLDER
+
+DIR holds the paper's networks as .npz files. All are measured on the committed reference states and on the planes'
+31 x 31 grids at tau = T, under the same simulators and seeds. MSE and success are over all states, "band" over those
+with friction inside the band of the targets. The paper's networks come twice: as they are, and masked, with V = 0 where
+friction makes the target unreachable, as ours always are.
+
+The last row is what outcomes alone allow: a plain network fitted to single Monte Carlo outcomes (fine simulator) of the
+first run's policy, from states of the same protocol, friction inside the band, and from the planes, with fresh seeds.
+FOLDER gets `baselines.md`, `baselines.json` with all numbers, and the figures of every model.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from pirl_rl import load_run
+from pirl_rl.evaluation import Accuracy, DriftStates, Rollouts, Slices
+from pirl_rl.evaluation.accuracy import SIMULATORS
+from pirl_rl.evaluation.drift_states import NETWORK_BOX
+from pirl_rl.evaluation.monte_carlo import Policy, mean_payoff
+from pirl_rl.evaluation.reference_states import displaced, visited_by
+from pirl_rl.initial_states import EquilibriumStates
+from pirl_rl.plots import save_figures
+from pirl_rl.problems import VehicleDrift
+from pirl_rl.simulator import Simulator
+
+COLUMNS = {
+    "paper_mse": "paper: MSE",
+    "paper_mse_band": "band",
+    "paper_success": "success",
+    "fine_mse": "fine: MSE",
+    "fine_mse_band": "band",
+    "fine_success": "success",
+    "fine_success_band": "band",
+    "fine_precision_p50": "precision V > 0.5",
+    "fine_recall_p50": "recall",
+    "slice_beta_r_mae": "beta-r: MAE",
+    "slice_beta_r_success": "success",
+    "slice_e_y_e_psi_mae": "e_y-e_psi: MAE",
+    "slice_e_y_e_psi_success": "success",
+}
+SEED = 7
+
+
+class Solved:
+    """Stands for a `Solution` of the drifting problem; V is masked by what is known."""
+
+    dtype, device = torch.float32, torch.device("cpu")
+
+    def __init__(self):
+        self.problem = VehicleDrift()
+
+    def policy(self, tau: Tensor, x: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def raw_value(self, tau: Tensor, x: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def value(self, tau: Tensor, x: Tensor) -> Tensor:
+        lost = self.problem.failed(x) | self.problem.unreachable(x)
+        return self.raw_value(tau, x).masked_fill(self.problem.reached(x), 1.0).masked_fill(lost, 0.0)
+
+
+class Baseline(Solved):
+    """One of the paper's: actor 8-32-32-2, ReLU and tanh; two critics 10-64-64-64-1, tanh and sigmoid; V their mean."""
+
+    def __init__(self, path: Path):
+        super().__init__()
+        with np.load(path, allow_pickle=False) as file:
+            weights = {name: torch.from_numpy(file[name]) for name in file.files if name.endswith(("weight", "bias"))}
+        self.actor = _stack(weights, "actor.net.", nn.ReLU(), nn.Tanh())
+        self.critics = [_stack(weights, f"critic.{twin}_net.net.", nn.Tanh(), nn.Sigmoid()) for twin in ("q1", "q2")]
+
+    def policy(self, tau: Tensor, x: Tensor) -> Tensor:
+        return self.problem.controls.denormalize(self.actor(network_inputs(tau, x)))
+
+    def raw_value(self, tau: Tensor, x: Tensor) -> Tensor:
+        inputs = network_inputs(tau, x)
+        inputs = torch.cat([inputs, self.actor(inputs)], -1)
+        return torch.stack([critic(inputs).squeeze(-1) for critic in self.critics]).mean(0)
+
+
+class Regression(Solved):
+    """V of a given policy by regression of outcomes: 3 x 128 tanh, binary cross-entropy, Adam with cosine decay."""
+
+    def __init__(self, policy: Policy, updates: int, rollouts: int):
+        super().__init__()
+        self._policy = policy
+        torch.manual_seed(SEED)
+        widths = (8, 128, 128, 128)
+        layers = [layer for a, b in pairwise(widths) for layer in (nn.Linear(a, b), nn.Tanh())]
+        self.network = nn.Sequential(*layers, nn.Linear(128, 1))
+        self._fit(*outcomes(self.problem, policy, rollouts), updates)
+
+    def policy(self, tau: Tensor, x: Tensor) -> Tensor:
+        return self._policy(tau, x)
+
+    @torch.no_grad()
+    def raw_value(self, tau: Tensor, x: Tensor) -> Tensor:
+        return self.network(network_inputs(tau, x)).squeeze(-1).sigmoid()
+
+    def _fit(self, inputs: Tensor, payoff: Tensor, updates: int) -> None:
+        optimizer = torch.optim.Adam(self.network.parameters(), lr=2e-3)
+        decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, updates)
+        for _ in range(updates):
+            batch = torch.randint(len(inputs), (2_048,))
+            logit = self.network(inputs[batch]).squeeze(-1)
+            optimizer.zero_grad()
+            nn.functional.binary_cross_entropy_with_logits(logit, payoff[batch]).backward()
+            optimizer.step()
+            decay.step()
+
+
+def outcomes(problem: VehicleDrift, policy: Policy, count: int) -> tuple[Tensor, Tensor]:
+    """Network inputs (N, 8) and single payoffs (N,) of about `count` paths, a tenth from each plane at tau = T."""
+    generator = torch.Generator().manual_seed(SEED)
+    visited = visited_by(Simulator(problem, **SIMULATORS["paper"]), policy, EquilibriumStates(), 8_192, generator)
+    states = [displaced(problem, *visited, NETWORK_BOX, generator, count, 0.40)]
+    for plane in problem.planes.values():
+        x = plane.embed(plane.box.sample(count // 10, generator))
+        states.append((torch.full((len(x),), problem.horizon), x))
+    tau, x = (torch.cat(parts) for parts in zip(*states, strict=True))
+    kept = problem.interior(x) & ~problem.unreachable(x)
+    tau, x = tau[kept], x[kept]
+    payoff = mean_payoff(Simulator(problem, **SIMULATORS["fine"]), policy, tau, x, 1, generator)
+    return network_inputs(tau, x), payoff.float()
+
+
+def network_inputs(tau: Tensor, x: Tensor) -> Tensor:
+    """(N, 8) in [-1, 1], tau first."""
+    return NETWORK_BOX.normalize(torch.cat([tau.unsqueeze(-1), x], -1))
+
+
+def _stack(weights: Mapping[str, Tensor], prefix: str, activation: nn.Module, output: nn.Module) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for name in sorted(name for name in weights if name.startswith(prefix) and name.endswith("weight")):
+        linear = nn.Linear(*weights[name].T.shape)
+        linear.load_state_dict({"weight": weights[name], "bias": weights[name.replace("weight", "bias")]})
+        layers += [linear, activation]
+    return nn.Sequential(*layers[:-1], output).requires_grad_(False)
+
+
+def markdown(results: Mapping[str, Mapping[str, float]]) -> str:
+    lines = ["| " + " | ".join(["model", *COLUMNS.values()]) + " |", "|---" + "|--:" * len(COLUMNS) + "|"]
+    for model, numbers in results.items():
+        cells = [f"{numbers[key]:.4f}" if "mse" in key else f"{numbers[key]:.3f}" for key in COLUMNS]
+        lines.append("| " + " | ".join([model, *cells]) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", type=Path, nargs="*", metavar="RUN_DIR")
+    parser.add_argument("--weights", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--rollouts", type=int, default=256, help="of each reference state")
+    parser.add_argument("--slice-rollouts", type=int, default=64, help="of each point of the planes' grids")
+    parser.add_argument("--fit-updates", type=int, default=10_000)
+    parser.add_argument("--fit-rollouts", type=int, default=1_000_000)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    results: dict[str, dict[str, float]] = {}
+
+    def measure(name: str, solution) -> None:
+        accuracy = Accuracy(DriftStates(), arguments.rollouts).measure(solution)
+        slices, rollouts = Slices(rollouts=arguments.slice_rollouts).measure(solution), Rollouts().measure(solution)
+        if isinstance(solution, Baseline):
+            unmasked = dataclasses.replace(accuracy, value=accuracy.raw_value)
+            results[name] = unmasked.numbers() | slices.numbers()
+            name = f"{name}, masked"
+        results[name] = accuracy.numbers() | slices.numbers()
+        save_figures(
+            accuracy.figures() | slices.figures() | rollouts.figures(), arguments.out / name.replace(", ", "-")
+        )
+        print(markdown({name: results[name]}).splitlines()[-1], flush=True)
+
+    for path in sorted(arguments.weights.glob("*.npz")):
+        measure(path.stem, Baseline(path))
+    solutions = {run.name: load_run(run).solution for run in arguments.runs}
+    for name, solution in solutions.items():
+        measure(name, solution)
+    if solutions:
+        name, solution = next(iter(solutions.items()))
+        fitted = Regression(solution.policy, arguments.fit_updates, arguments.fit_rollouts)
+        measure(f"{name}, regression of its outcomes", fitted)
+    (arguments.out / "baselines.md").write_text(markdown(results))
+    (arguments.out / "baselines.json").write_text(json.dumps(results, indent=2) + "\n")
+    print("\n" + markdown(results))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+"""A curriculum: stages of training, each with its own starts of episodes, loss schedule and collocation."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+
+from pirl_rl.collocation import Collocation
+from pirl_rl.initial_states import InitialStates
+from pirl_rl.schedules import Schedule, Weights
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """One stage; what is None stays as the run has it.
+
+    Attributes:
+        updates: its length, in the unit of all stages: a run of another length stretches them all.
+        schedule: loss weights by the stage's own updates, from 0.
+        initial_states: law of the starts.
+        collocation: sampler of the interior points.
+        actor_every: critic updates for each update of the actor and the targets.
+    """
+
+    updates: float
+    schedule: Schedule | None = None
+    initial_states: InitialStates | None = None
+    collocation: Collocation | None = None
+    actor_every: int | None = None
+
+    def __post_init__(self):
+        if not self.updates > 0:
+            raise ValueError(f"stage.updates: expected a number > 0, got {self.updates}")
+        if self.actor_every is not None and self.actor_every < 1:
+            raise ValueError(f"stage.actor_every: expected at least 1, got {self.actor_every}")
+
+
+class Curriculum:
+    """Stages one after another, stretched to the length of the run; a `Schedule` itself.
+
+    Args:
+        schedule: of the stages that have none, by the run's updates.
+        updates: length of the run.
+        stages: at least one.
+    """
+
+    def __init__(self, schedule: Schedule, updates: int, stages: Sequence[Stage] = (Stage(1.0),)):
+        if not stages:
+            raise ValueError("curriculum.stages: expected at least one stage, got none")
+        self.schedule, self.stages = schedule, tuple(stages)
+        self._before = [0.0, *accumulate(stage.updates for stage in stages)]
+        self._stretch = updates / self._before.pop()
+        # Rounding of the stretch is not to shift a stage by one update.
+        self._starts = [math.ceil(before * self._stretch - 1e-6) for before in self._before]
+        self._updates = updates
+
+    def index(self, update: int) -> int:
+        """The stage of an update; the last one goes on for ever."""
+        return bisect_right(self._starts, update) - 1
+
+    def span(self, index: int) -> range:
+        """The updates of a stage."""
+        return range(self._starts[index], [*self._starts, self._updates][index + 1])
+
+    def begins(self, update: int) -> bool:
+        """Whether a stage begins with this update."""
+        return update in self._starts
+
+    def __call__(self, update: int) -> Weights:
+        schedule, own = self._schedule(update)
+        return schedule(own)
+
+    def progress(self, update: int) -> float:
+        schedule, own = self._schedule(update)
+        return schedule.progress(own)
+
+    def _schedule(self, update: int) -> tuple[Schedule, float]:
+        """The schedule of an update's stage, and the update in that schedule's own count."""
+        index = self.index(update)
+        schedule = self.stages[index].schedule
+        return (self.schedule, update) if schedule is None else (schedule, update / self._stretch - self._before[index])

@@ -1,0 +1,267 @@
+"""Vehicle drifting, Sec. V-B of the paper: bring a sliding car into the neighbourhood of an unstable drift equilibrium.
+
+State x = (e_y, e_psi, v_x, v_y, r, delta, mu): lateral (m) and course error (rad) to a path of constant curvature,
+velocities in the body frame (m/s), yaw rate (rad/s), steering angle (rad), friction (constant along a path). Control
+u = (delta', F_x): steering rate (rad/s), drive force (N).
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+import torch
+from scipy.interpolate import CubicSpline
+from scipy.optimize import root
+from torch import Tensor
+
+from pirl_rl.payoffs import Payoff
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.problems import vehicle
+from pirl_rl.sets import Box, Plane, band
+
+DEGREE = math.pi / 180
+CURVATURE = 0.600 * math.cos(-20.44 * DEGREE) / 8.0  # 1/m, of the path
+SPEED = 8.0  # m/s, v_x of the equilibria
+FRICTION_RANGE = (0.25, 1.05)
+KNOTS = 513
+
+
+class VehicleDrift(ReachAvoidProblem):
+    """Reach the drift equilibrium of the state's own friction within T = 5 s, before the car leaves lane or limits."""
+
+    horizon = 5.0
+    states = Box([-2.0, -0.8, 4.0, -8.0, -2.5, -0.7, 0.5], [2.0, 0.8, 12.0, 8.0, 2.5, 0.7, 0.6])
+    controls = Box([-1.5, 1000.0], [1.5, 5000.0])
+    tolerances = {"e_y": 0.2, "e_psi": 4 * DEGREE, "v_x": 0.5, "beta": 4 * DEGREE, "r": 0.2, "delta": 10 * DEGREE}
+    friction_band = (0.5, 0.6)  # where equilibria are targets
+    noise = (0.03, 0.015, 0.20, 0.20, 0.05, 0.01)  # per sqrt(s); friction has none
+    state_names = ("e_y (m)", "e_psi (rad)", "v_x (m/s)", "v_y (m/s)", "r (rad/s)", "delta (rad)", "friction")
+    control_names = ("delta' (rad/s)", "F_x (N)")
+
+    def __init__(self, payoff: Payoff | None = None, horizon: float | None = None):
+        super().__init__(payoff, horizon)
+        # Solved here: a transform of torch.func, in which the levels may first be asked for, lets nothing out to scipy.
+        table = torch.from_numpy(_equilibrium_table())
+        self._tables: dict[tuple[torch.dtype, torch.device], Tensor] = {(table.dtype, table.device): table}
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        e_y, e_psi, v_x, v_y, r, delta, friction = x.unbind(-1)
+        v_x, friction = v_x.clamp(min=vehicle.LEAST_SPEED), friction.clamp(*FRICTION_RANGE)
+        delta_rate, demand = u.unbind(-1)
+        drive = vehicle.drive_force(demand.clamp(self.controls.low[1], self.controls.high[1]), friction)
+        sin_delta, cos_delta = delta.sin(), delta.cos()
+        front = vehicle.front_force(v_x, v_y, r, sin_delta / cos_delta, friction)
+        rear = vehicle.rear_force(v_x, v_y, r, friction, drive)
+        sin_psi, cos_psi = e_psi.sin(), e_psi.cos()
+        across, along = v_x * sin_psi + v_y * cos_psi, v_x * cos_psi - v_y * sin_psi
+        # Rows first: each derivative stays contiguous in memory.
+        rates = [
+            across,
+            r - CURVATURE * along / (1 - CURVATURE * e_y).clamp(min=0.2),
+            (drive - front * sin_delta) / vehicle.MASS + v_y * r,
+            (rear + front * cos_delta) / vehicle.MASS - v_x * r,
+            (vehicle.FRONT_ARM * front * cos_delta - vehicle.REAR_ARM * rear) / vehicle.YAW_INERTIA,
+            delta_rate.clamp(self.controls.low[0], self.controls.high[0]),
+            torch.zeros_like(friction),
+        ]
+        return torch.stack(rates).movedim(0, -1)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        columns = torch.zeros(7, 6, dtype=x.dtype, device=x.device)
+        columns.diagonal().copy_(torch.tensor(self.noise, dtype=x.dtype, device=x.device))
+        return columns.expand(*x.shape, 6)
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        e_y, e_psi, v_x, v_y, r, delta, friction = x.unbind(-1)
+        beta, yaw, steering = self.equilibrium_curves(friction)
+        tolerance = self.tolerances
+        low, high = self.friction_band
+        bands = [
+            band(e_y, 0.0, tolerance["e_y"]),
+            band(e_psi, -beta, tolerance["e_psi"]),
+            band(v_x, SPEED, tolerance["v_x"]),
+            band(torch.atan2(v_y, v_x.clamp(min=vehicle.LEAST_SPEED)), beta, tolerance["beta"]),
+            band(r, yaw, tolerance["r"]),
+            band(delta, steering, tolerance["delta"]),
+            torch.maximum(low - friction, friction - high),  # unlike `band`, without rounding at the band's edges
+        ]
+        return torch.stack(bands).movedim(0, -1)
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        e_y, e_psi, v_x, v_y, r, delta, friction = x.unbind(-1)
+        low, high = FRICTION_RANGE
+        bounds = [
+            2.0 - e_y.abs(),
+            0.8 - e_psi.abs(),
+            v_x - 3.0,
+            25.0 - v_x,
+            12.0 - v_y.abs(),
+            2.5 - r.abs(),
+            0.7 - delta.abs(),
+            v_x - v_y.abs(),  # a sideslip angle beta of 45 degrees
+            friction - low,
+            high - friction,
+        ]
+        return torch.stack(bounds).movedim(0, -1)
+
+    def unreachable(self, x: Tensor) -> Tensor:
+        """Friction stays as it is, and no equilibrium is a target outside the band."""
+        low, high = self.friction_band
+        return (x[..., 6] < low) | (x[..., 6] > high)
+
+    def equilibrium_curves(self, friction: Tensor) -> tuple[Tensor, ...]:
+        """beta, r, delta, each (*), of the equilibrium at friction (*), at the band's edge outside it.
+
+        Linear between knots, to 3e-7: the rear tyre slides in all the band, so the curves are smooth.
+        """
+        low, high = self.friction_band
+        position = ((friction - low) * ((KNOTS - 1) / (high - low))).clamp(0, KNOTS - 1)
+        knot = position.long().clamp(max=KNOTS - 2)
+        table = self._table(friction)
+        return torch.lerp(table[knot], table[knot + 1], (position - knot).unsqueeze(-1)).unbind(-1)
+
+    def around_equilibrium(
+        self,
+        friction: Tensor,
+        e_y: Tensor | None = None,
+        e_psi: Tensor | None = None,
+        beta: Tensor | None = None,
+        r: Tensor | None = None,
+    ) -> Tensor:
+        """States (N, 7) at v_x = 8 m/s, each entry (N,) that is not given at the equilibrium of its friction (N,)."""
+        sideslip, yaw, steering = self.equilibrium_curves(friction)
+        beta = sideslip if beta is None else beta
+        rows = [
+            torch.zeros_like(friction) if e_y is None else e_y,
+            -sideslip if e_psi is None else e_psi,
+            torch.full_like(friction, SPEED),
+            SPEED * beta.tan(),
+            yaw if r is None else r,
+            steering,
+            friction,
+        ]
+        return torch.stack(rows).movedim(0, -1)
+
+    def faces(self, count: int, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        """Half of the points on the target's faces, half on those of the avoid set, at friction inside the band.
+
+        Only where all vertex controls drive the car into the set: there V is continuous. Where it can leave a face, V
+        jumps within a layer of less than a centimetre or its like, since the noise is weak: data there would teach a
+        network that cannot see the layer the wrong value of its surroundings.
+        """
+        target = _drawn(lambda n: self._target_faces(n, generator), lambda x: self._enters(x, self.reached), count // 2)
+        rest = count - count // 2
+        avoid = _drawn(lambda n: self._avoid_faces(n, generator), lambda x: self._enters(x, self.failed), rest)
+        value = torch.cat([torch.ones(len(target)), torch.zeros(len(avoid))]).to(target)
+        return torch.cat([target, avoid]), value
+
+    @property
+    def planes(self) -> dict[str, Plane]:
+        """The sections of the paper's figures: through the equilibrium at friction 0.55."""
+
+        def states(**coordinates: Tensor) -> Tensor:
+            first = next(iter(coordinates.values()))
+            return self.around_equilibrium(torch.full_like(first, 0.55), **coordinates)
+
+        return {
+            "beta_r": Plane(
+                ("sideslip beta (rad)", "yaw rate r (rad/s)"),
+                Box([-math.pi / 4, -2.5], [math.pi / 4, 2.5]),
+                lambda points: states(beta=points[..., 0], r=points[..., 1]),
+                lambda x: torch.stack([torch.atan2(x[..., 3], x[..., 2]), x[..., 4]], -1),
+            ),
+            "e_y_e_psi": Plane(
+                ("lateral error e_y (m)", "course error e_psi (rad)"),
+                Box([-2.0, -0.2], [2.0, 0.8]),
+                lambda points: states(e_y=points[..., 0], e_psi=points[..., 1]),
+                lambda x: x[..., :2],
+            ),
+        }
+
+    def _table(self, like: Tensor) -> Tensor:
+        key = (like.dtype, like.device)
+        if key not in self._tables:
+            self._tables[key] = torch.from_numpy(_equilibrium_table()).to(like)
+        return self._tables[key]
+
+    def _target_faces(self, count: int, generator: torch.Generator | None) -> Tensor:
+        """Points of the target with one of its six bounded coordinates at its bound."""
+        unit = 2 * torch.rand(count, 7, generator=generator, dtype=torch.float64) - 1
+        side = torch.randint(6, (count,), generator=generator)
+        rows = torch.arange(count)
+        unit[rows, side] = unit[rows, side].sign()
+        low, high = self.friction_band
+        friction = (low + high) / 2 + unit[:, 6] * (high - low) / 2
+        offset = unit[:, :6] * torch.tensor(list(self.tolerances.values()), dtype=torch.float64)
+        sideslip, yaw, steering = self.equilibrium_curves(friction)
+        v_x = SPEED + offset[:, 2]
+        columns = [offset[:, 0], offset[:, 1] - sideslip, v_x, v_x * (sideslip + offset[:, 3]).tan()]
+        return torch.stack([*columns, yaw + offset[:, 4], steering + offset[:, 5], friction], -1)
+
+    def _avoid_faces(self, count: int, generator: torch.Generator | None) -> Tensor:
+        """Points of the envelope with one bound met; bounds outside `states` are left out."""
+        x = self.states.sample(count, generator, dtype=torch.float64)
+        side = torch.randint(5, (count,), generator=generator)
+        sign = torch.where(torch.rand(count, generator=generator, dtype=torch.float64) < 0.5, -1.0, 1.0).double()
+        for index, (column, bound) in enumerate(((0, 2.0), (1, 0.8), (4, 2.5))):
+            x[:, column] = torch.where(side == index, sign * bound, x[:, column])
+        x[:, 2] = torch.where(side == 3, torch.full_like(sign, 3.0), x[:, 2])
+        x[:, 3] = torch.where(side == 4, sign * x[:, 2], x[:, 3])
+        return x
+
+    def _enters(self, x: Tensor, absorbs) -> Tensor:
+        """(N,) bool: from just outside the set, a short step of every vertex control ends inside, and none before."""
+        corners = torch.cartesian_prod(*torch.tensor([self.controls.low, self.controls.high], dtype=x.dtype).mT)
+        step = 1e-5
+        inside = [absorbs(x + step * self.drift(x, corner.expand(len(x), 2))) for corner in corners]
+        before = [absorbs(x - step * self.drift(x, corner.expand(len(x), 2))) for corner in corners]
+        return torch.stack(inside).all(0) & ~torch.stack(before).any(0)
+
+
+def _drawn(draw, keep, count: int) -> Tensor:
+    """Exactly `count` of the drawn points that are kept."""
+    x = draw(2 * count)
+    found = x[keep(x)]
+    while len(found) < count:
+        x = draw(2 * count)
+        found = torch.cat([found, x[keep(x)]])
+    return found[:count]
+
+
+def equilibrium(friction: float) -> tuple[np.ndarray, np.ndarray]:
+    """The drift equilibrium of one friction: state (7,) and control (2,), to the accuracy of a float64 root.
+
+    v_x = 8 m/s and e_y = 0 are given; beta, r, delta and F_x solve e_psi' = v_x' = v_y' = r' = 0 with e_psi = -beta.
+
+    Raises:
+        ArithmeticError: where the root finder does not converge.
+    """
+    problem = VehicleDrift.__new__(VehicleDrift)  # without the table, which is made of these equilibria
+
+    def point(unknown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        beta, r, delta, force = unknown
+        return np.array([0.0, -beta, SPEED, SPEED * math.tan(beta), r, delta, friction]), np.array([0.0, 1000 * force])
+
+    def residual(unknown: np.ndarray) -> np.ndarray:
+        x, u = (torch.from_numpy(entry) for entry in point(unknown))
+        return problem.drift(x, u)[1:5].numpy()
+
+    start = -20.44 * DEGREE
+    guess = [start, CURVATURE * SPEED / math.cos(start), -12 * DEGREE, 2.293]
+    found = root(residual, guess, method="hybr", tol=1e-14)
+    if np.abs(found.fun).max() > 1e-9:
+        raise ArithmeticError(f"no drift equilibrium found at friction {friction}: residual {found.fun}")
+    return point(found.x)
+
+
+@cache
+def _equilibrium_table() -> np.ndarray:
+    """beta, r, delta of the equilibria at KNOTS equidistant frictions of the band, (KNOTS, 3).
+
+    A spline through every eighth of them: tenths of a second in place of seconds, for an error of 3e-8.
+    """
+    knots = np.linspace(*VehicleDrift.friction_band, KNOTS)
+    solved = np.stack([equilibrium(friction)[0] for friction in knots[::8]])
+    return CubicSpline(knots[::8], solved[:, [1, 4, 5]] * [-1, 1, 1])(knots)

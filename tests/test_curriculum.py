@@ -1,0 +1,87 @@
+"""Stages: where they begin, what they stretch, and what the trainer takes over from them."""
+
+from __future__ import annotations
+
+import pytest
+from small import assert_same, at_update, interrupt, resumed, small_trainer
+
+from pirl_rl import checkpoint
+from pirl_rl.curriculum import Curriculum, Stage
+from pirl_rl.schedules import ConstantSchedule, LinearSchedule, LossSchedule
+from pirl_rl.trainer import Interrupted
+
+WHOLE = LossSchedule([1, 0, 0], [0, 1, 1], center=50, steepness=0.1)
+
+
+def test_without_schedules_of_their_own_stages_leave_the_run_s():
+    curriculum = Curriculum(WHOLE, 100, [Stage(1), Stage(3)])
+    for k in (0, 24, 25, 99, 100):
+        assert curriculum(k) == WHOLE(k)
+        assert curriculum.progress(k) == WHOLE.progress(k)
+
+
+@pytest.mark.parametrize("updates", [7, 40, 90, 4_000_000])
+def test_stages_stretch_to_the_run(updates):
+    """A run of any length sees the same weights at the same fraction of it."""
+    ramp = LinearSchedule([1, 0, 0], [1, 2, 2], start=0, end=3e5)
+    stages = [Stage(1e5, ConstantSchedule([1, 0, 0], [1, 0, 0])), Stage(3e5, ramp)]
+    curriculum = Curriculum(WHOLE, updates, stages)
+    for k in range(0, updates, max(1, updates // 50)):
+        own = 4e5 * k / updates
+        assert curriculum.index(k) == (own >= 1e5)
+        assert curriculum(k)[1] == pytest.approx(max(0.0, 2 * (own - 1e5) / 3e5), abs=1e-9)
+    assert curriculum.index(updates) == 1
+
+
+def test_each_stage_begins_once():
+    curriculum = Curriculum(WHOLE, 30, [Stage(1)] * 3)
+    assert [k for k in range(30) if curriculum.begins(k)] == [0, 10, 20]
+    assert [curriculum.span(index) for index in range(3)] == [range(10), range(10, 20), range(20, 30)]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Stage(0), "stage.updates: expected a number > 0, got 0"),
+        (lambda: Stage(1, actor_every=0), "stage.actor_every"),
+        (lambda: Curriculum(WHOLE, 10, []), "at least one stage"),
+    ],
+)
+def test_errors(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+STAGES = (
+    "stages=[{updates: 1, initial_states: {_target_: pirl_rl.initial_states.UniformStates, low: [0], high: [1]}},"
+    "{updates: 1, actor_every: 5, collocation: {_target_: pirl_rl.collocation.ReplayCollocation, size: 7}}]",
+    "trainer.updates=10",
+)
+
+
+def test_the_trainer_takes_over_what_a_stage_sets(tmp_path):
+    trainer = small_trainer(tmp_path, *STAGES)
+    seen = []
+    step = trainer.collector.step
+
+    def watch(k):
+        law = trainer.collector.initial_states.box
+        seen.append((law and law.low, trainer.collocation.size, trainer.learner.actor_every))
+        step(k)
+
+    trainer.collector.step = watch
+    trainer.train()
+    size = small_trainer(tmp_path / "other", *STAGES).collocation.size
+    assert seen == [((0.0,), size, 2)] * 5 + [(None, 7, 5)] * 5
+
+
+def test_resume_inside_a_stage_is_exact(tmp_path):
+    small_trainer(tmp_path / "whole", *STAGES).train()
+    stopped = small_trainer(tmp_path / "cut", *STAGES)
+    at_update(stopped, 7, interrupt)
+    with pytest.raises(Interrupted):
+        stopped.train()
+    resumed(tmp_path / "cut", *STAGES).train()
+    ends = [checkpoint.load(tmp_path / name / checkpoint.FOLDER / checkpoint.LAST) for name in ("whole", "cut")]
+    assert ends[0]["update"] == 10
+    assert_same(*ends)
