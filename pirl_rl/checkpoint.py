@@ -47,3 +47,10 @@ def load(path: Path) -> dict[str, Any]:
 
 def weights_path(folder: Path, update: int) -> Path:
     return folder / f"weights-{update:09d}.pt"
+
+
+def newest(run: Path) -> Path:
+    """The file of a run directory with its last weights: `last.pt`, or in an exported one the last `weights-*.pt`."""
+    folder = run / FOLDER
+    kept = sorted(folder.glob("weights-*.pt"))
+    return kept[-1] if kept and not (folder / LAST).exists() else folder / LAST

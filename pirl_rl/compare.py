@@ -27,9 +27,16 @@ COLUMNS = (
     ("reward mean", "reward", np.mean),
     ("reward min", "reward", np.min),
     ("reward / optimal min", "reward_share", np.min),
-    *((name, name, np.mean) for name in (*LOSSES, "updates", "wall_seconds")),
+    ("fine_success mean", "fine_success", np.mean),
+    ("fine_success min", "fine_success", np.min),
+    ("fine_mse_band mean", "fine_mse_band", np.mean),
+    ("fine_mse_band worst", "fine_mse_band", np.max),
+    *((name, name, np.mean) for name in (*LOSSES, "value_slope", "updates", "wall_seconds")),
 )
-"""Column of the table, key of summary.json, statistic over the group's runs."""
+"""Column of the table, key of summary.json, statistic over the group's runs; columns that no run has are left out."""
+
+ERRORS = {"value_mse": "MSE against the exact V", "fine_mse_band": "MSE against Monte Carlo, friction inside the band"}
+"""What stands for the error of V in the figure: the first that a run has."""
 
 
 SHARE = "reward / optimal reward, where known"
@@ -92,11 +99,13 @@ def _read_run(path: Path) -> Run:
 
 def table(groups: dict[str, list[Run]]) -> str:
     """A Markdown table, a row for each group; a dash where no run of the group has the number."""
-    header = ["group", "seeds", *(title for title, _, _ in COLUMNS)]
+    runs = [run for group in groups.values() for run in group]
+    columns = [column for column in COLUMNS if any(math.isfinite(run.get(column[1])) for run in runs)]
+    header = ["group", "seeds", *(title for title, _, _ in columns)]
     lines = [header, ["---", *["---:"] * (len(header) - 1)]]
     for label, runs in groups.items():
         cells = []
-        for _, name, statistic in COLUMNS:
+        for _, name, statistic in columns:
             values = _finite([run.get(name) for run in runs])
             cells.append(_number(name, float(statistic(values))) if len(values) else "-")
         lines.append([label, str(len(runs)), *cells])
@@ -109,11 +118,13 @@ def draw(groups: dict[str, list[Run]]) -> Figure:
     grid = figure.add_gridspec(2, 12)
     reward, mse, both = (figure.add_subplot(grid[0, 4 * i : 4 * i + 4]) for i in range(3))
     _per_seed(reward, groups, "reward_share", "Reward of each seed", SHARE)
-    _per_seed(mse, groups, "value_mse", "MSE of V of each seed", "MSE against the exact V")
-    errors = [run.get("value_mse") for runs in groups.values() for run in runs]
+    runs = [run for group in groups.values() for run in group]
+    name = next((name for name in ERRORS if any(math.isfinite(run.get(name)) for run in runs)), "value_mse")
+    _per_seed(mse, groups, name, "MSE of V of each seed", ERRORS[name])
+    errors = [run.get(name) for run in runs]
     log_scale(mse, "y", errors)
     log_scale(both, "x", errors)
-    _reward_against_mse(both, groups)
+    _reward_against_mse(both, groups, name)
     for i, name in enumerate(("hjb_loss", "boundary_loss", "td_loss", "hjb_sup_loss")):
         axes = figure.add_subplot(grid[1, 3 * i : 3 * i + 3])
         for color, runs in _colored(groups):
@@ -138,15 +149,15 @@ def _per_seed(axes: Axes, groups: dict[str, list[Run]], name: str, title: str, y
     axes.grid(axis="y", alpha=0.3)
 
 
-def _reward_against_mse(axes: Axes, groups: dict[str, list[Run]]) -> None:
+def _reward_against_mse(axes: Axes, groups: dict[str, list[Run]], error: str) -> None:
     for label, (color, runs) in zip(groups, _colored(groups), strict=True):
-        pairs = np.array([(run.get("value_mse"), run.get("reward_share")) for run in runs])
+        pairs = np.array([(run.get(error), run.get("reward_share")) for run in runs])
         pairs = pairs[np.isfinite(pairs).all(-1)]
         axes.scatter(*pairs.T, s=14, alpha=0.6, color=color)
         # The empty scatter of a group without exact values still gives the legend its entry.
         mean = pairs.mean(0, keepdims=True) if len(pairs) else pairs
         axes.scatter(*mean.T, s=130, color=color, edgecolors="black", label=label)
-    axes.set(title="Reward against MSE, large: mean", xlabel="MSE against the exact V", ylabel=SHARE)
+    axes.set(title="Reward against MSE, large: mean", xlabel=ERRORS[error], ylabel=SHARE)
     axes.grid(alpha=0.3)
 
 
@@ -176,7 +187,7 @@ def _finite(values: Sequence[float]) -> np.ndarray:
 def _number(name: str, value: float) -> str:
     if name in ("updates", "wall_seconds"):
         return f"{value:.0f}"
-    return f"{value:.4f}" if name.startswith("reward") else f"{value:.2e}"
+    return f"{value:.4f}" if name.startswith(("reward", "fine_success")) else f"{value:.2e}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

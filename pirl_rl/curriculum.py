@@ -55,15 +55,10 @@ class Curriculum:
         self._stretch = updates / self._before.pop()
         # Rounding of the stretch is not to shift a stage by one update.
         self._starts = [math.ceil(before * self._stretch - 1e-6) for before in self._before]
-        self._updates = updates
 
     def index(self, update: int) -> int:
         """The stage of an update; the last one goes on for ever."""
         return bisect_right(self._starts, update) - 1
-
-    def span(self, index: int) -> range:
-        """The updates of a stage."""
-        return range(self._starts[index], [*self._starts, self._updates][index + 1])
 
     def begins(self, update: int) -> bool:
         """Whether a stage begins with this update."""

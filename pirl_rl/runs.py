@@ -67,13 +67,13 @@ def _tensor(x, solution: Solution) -> tuple[Tensor, Callable]:
     return state, lambda answer: np.asarray(answer.cpu())
 
 
-def load_run(folder: str | Path, trust: Sequence[str] = (), weights: str = checkpoint.LAST, device: str = "cpu") -> Run:
+def load_run(folder: str | Path, trust: Sequence[str] = (), weights: str | None = None, device: str = "cpu") -> Run:
     """Open a run directory.
 
     Args:
-        folder: as `train` left it.
+        folder: as `train` or `export` left it.
         trust: modules outside pirl_rl that its configuration may name, e.g. your own problem's.
-        weights: file in `checkpoints/`.
+        weights: file in `checkpoints/`; default the last.
         device: where the networks go.
 
     Raises:
@@ -83,9 +83,9 @@ def load_run(folder: str | Path, trust: Sequence[str] = (), weights: str = check
     folder = Path(folder)
     config = load_config(folder)
     config.device = device
-    if Path(weights).name != weights:
+    if weights is not None and Path(weights).name != weights:
         raise CheckpointError(f"weights: expected the name of a file in {folder / checkpoint.FOLDER}, got {weights}")
-    path = folder / checkpoint.FOLDER / weights
+    path = checkpoint.newest(folder) if weights is None else folder / checkpoint.FOLDER / weights
     state = checkpoint.load(path)
     loss = make_loss(config, build(config.env.problem, "env.problem", trust), trust)
     with fitting(path):

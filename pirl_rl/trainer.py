@@ -31,6 +31,9 @@ EVALUATED = ("value_mse", "success_rate", "calibration_mse", "hjb_loss", "td_los
 TRAINED = ("train_td_loss", "train_hjb_loss", "train_boundary_loss")
 """What the progress shows, of an evaluation and between evaluations."""
 
+NEGLIGIBLE = 1e-6
+"""Weights below this share of their largest of the run, as a sigmoid has far from its center, are taken for zero."""
+
 
 class Interrupted(Exception):
     """Training was asked to stop; everything is saved."""
@@ -99,7 +102,8 @@ class Trainer:
         self.config = dict(config or {})
         self.solution = Solution(learner.loss)
         self.rng = torch.Generator(self.solution.device).manual_seed(seed)
-        self.terms = self._terms(range(updates + 1))
+        weights = [learner.schedule(k) for k in (*range(0, updates, max(1, updates // 1_000)), updates)]
+        self.largest = tuple(max(values) for values in zip(*weights, strict=True))
         self.update, self.saved, self.wall_seconds = 0, 0, 0.0
 
     def train(self) -> dict[str, float]:
@@ -149,21 +153,16 @@ class Trainer:
         """Take over what the stage of the next update sets, and the run's own for the rest."""
         if self.stages is None:
             return
-        index = self.stages.index(self.update)
-        stage, (initial_states, collocation, actor_every) = self.stages.stages[index], self._unstaged
-        self.terms = self._terms(self.stages.span(index))
+        stage = self.stages.stages[self.stages.index(self.update)]
+        initial_states, collocation, actor_every = self._unstaged
         self.collector.initial_states = stage.initial_states or initial_states
         self.collocation = stage.collocation or collocation
         self.learner.actor_every = stage.actor_every or actor_every
 
-    def _terms(self, updates: Sequence[int]) -> tuple[bool, ...]:
-        """Which terms are worth computing: one whose weight is zero at all of these updates is not."""
-        weights = [self.learner.schedule(k) for k in (*updates[:: max(1, len(updates) // 1_000)], updates[-1])]
-        return tuple(max(values) > 0 for values in zip(*weights, strict=True))
-
     def sample(self) -> TensorDict:
-        """The batch of one update."""
-        td, hjb, boundary = self.terms
+        """The batch of one update; a term of negligible weight is left out of the work."""
+        weights = self.learner.schedule(self.update)
+        td, hjb, boundary = (w > NEGLIGIBLE * most for w, most in zip(weights, self.largest, strict=True))
         replay = self.collector.buffer.sample(self.batch_size)
         parts = {"replay": replay if td else replay.exclude("next")}
         if hjb:

@@ -99,6 +99,16 @@ def test_rows_hold_the_weights_losses_and_evaluations(whole):
     assert float(rows[20]["learning_rate"]) < float(rows[1]["learning_rate"])
 
 
+def test_a_term_is_left_out_while_its_weight_is_negligible(tmp_path):
+    """A sigmoid of steepness 5 is 4e-6 at 2.5 updates before its center, and below 1e-6 at 3 before."""
+    trainer = small_trainer(tmp_path, "method=pirl", "schedule.center=9.5", "schedule.steepness=5")
+    trainer.collector.start()
+    parts = []
+    for trainer.update in range(20):
+        parts.append("collocation" in trainer.sample().keys())
+    assert parts == [False] * 7 + [True] * 13
+
+
 def test_terms_without_weight_are_left_out(tmp_path):
     kept = {"td3": {"td_loss"}, "pinn": {"hjb_loss", "boundary_loss"}, "pirl": {"td_loss", "hjb_loss", "boundary_loss"}}
     for method, terms in kept.items():
@@ -112,7 +122,7 @@ def test_nan_stops_with_update_and_term(tmp_path):
     sample = trainer.collocation.sample
 
     def spoil():
-        trainer.collocation.sample = lambda rng: sample(rng).apply(
+        trainer.collocation.sample = lambda rng, *rest: sample(rng).apply(
             lambda x: x * math.nan if x.is_floating_point() else x
         )
 
@@ -133,7 +143,7 @@ def test_explosion_stops_with_update_and_term(tmp_path):
 
 def scale_boundary(trainer, factor: float) -> None:
     sample = trainer.boundary.sample
-    trainer.boundary.sample = lambda rng: (batch := sample(rng)).set("value", batch["value"] * factor + factor)
+    trainer.boundary.sample = lambda rng, *rest: (batch := sample(rng)).set("value", batch["value"] * factor + factor)
 
 
 def test_spoilt_networks_are_not_saved(tmp_path):
