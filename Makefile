@@ -1,5 +1,5 @@
 PYTHON ?= python3
-EXPERIMENT ?= reach1d
+EXPERIMENT ?= drift
 ARGS ?=
 
 VENV := .venv
@@ -14,7 +14,7 @@ help: ## Print this list
 
 setup: $(READY) ## Create .venv with the pinned dependencies (PYTHON=python3.12 picks the interpreter)
 
-train: $(READY) ## Train EXPERIMENT=reach1d; ARGS="seed=3 device=cpu" overrides its settings
+train: $(READY) ## Train EXPERIMENT=drift; ARGS="seed=3 device=cpu" overrides its settings
 	$(BIN)/python -m pirl_rl.train +experiment=$(EXPERIMENT) $(ARGS)
 
 test: $(READY) ## Run the tests that are neither slow nor gpu; ARGS go to pytest

@@ -15,6 +15,8 @@ from pirl_rl.files import replacing
 
 FOLDER = "checkpoints"
 LAST = "last.pt"
+TARGET = "target_"
+"""Begins the names of the target networks' parameters, which may be missing where nothing is trained further."""
 
 
 class CheckpointError(RuntimeError):
@@ -47,6 +49,13 @@ def load(path: Path) -> dict[str, Any]:
 
 def weights_path(folder: Path, update: int) -> Path:
     return folder / f"weights-{update:09d}.pt"
+
+
+def loss_state(state: dict[str, Any]) -> dict[str, Any]:
+    """The loss module's state; the networks themselves stand for targets that are missing."""
+    loss = state.get("learner", state)["loss"]
+    own = {name: entry for name, entry in loss.items() if "network_params" in name and not name.startswith(TARGET)}
+    return {f"{TARGET}{name}": entry for name, entry in own.items()} | loss
 
 
 def newest(run: Path) -> Path:

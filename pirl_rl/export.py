@@ -1,7 +1,7 @@
 """Export: `python -m pirl_rl.export run=RUN_DIR out=FOLDER`.
 
-Copies what `load_run` and a reader need of a run: the weights without buffer and optimisers, the configuration, the
-summary, the metrics and the figures.
+Copies what `load_run` and a reader need of a run: the weights without targets, buffer and optimisers, the
+configuration, the summary, the metrics and the figures.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pirl_rl import checkpoint
+from pirl_rl.checkpoint import TARGET
 from pirl_rl.configuration import ConfigError, load_config, save_config
 from pirl_rl.console import told
 from pirl_rl.evaluate import RESULTS
@@ -35,9 +36,9 @@ def export(run: Path, out: Path) -> Path:
     if out.exists():
         raise ConfigError(f"out: {out} exists, and an export never overwrites anything")
     save_config(config, out)
-    weights = {"loss": state.get("learner", state)["loss"], "update": state["update"]}
+    loss = {name: entry for name, entry in checkpoint.loss_state(state).items() if not name.startswith(TARGET)}
     path = checkpoint.weights_path(out / checkpoint.FOLDER, state["update"])
-    checkpoint.save(weights, path)
+    checkpoint.save({"loss": loss, "update": state["update"]}, path)
     for name in COPIED:
         if (run / name).is_dir():
             shutil.copytree(run / name, out / name)

@@ -89,7 +89,7 @@ def load_run(folder: str | Path, trust: Sequence[str] = (), weights: str | None 
     state = checkpoint.load(path)
     loss = make_loss(config, build(config.env.problem, "env.problem", trust), trust)
     with fitting(path):
-        loss.load_state_dict(state.get("learner", state)["loss"])
+        loss.load_state_dict(checkpoint.loss_state(state))
     return Run(Solution(loss), config, int(state["update"]))
 
 
