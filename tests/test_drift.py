@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pirl_rl.envs import DriftEnv
 from pirl_rl.payoffs import LipschitzPayoff
-from pirl_rl.problems import VehicleDrift, VehicleDrift3, drift, vehicle
+from pirl_rl.problems import VehicleDrift, VehicleDrift3, equilibria, vehicle
 from pirl_rl.simulator import Simulator
 
 GOLDEN = np.load(Path(__file__).parent / "data" / "drift_golden.npz")
@@ -134,23 +134,23 @@ def test_equilibria():
     """State and control at eleven frictions, the band's ends among them, all in the target; and the curves, which err
     by 1e-6 at most between knots."""
     for friction, _, e_psi, v_x, v_y, beta, r, delta, force in GOLDEN["equilibria"]:
-        x, u = drift.equilibrium(friction)
+        x, u = equilibria.equilibrium(friction)
         np.testing.assert_allclose(x, [0, e_psi, v_x, v_y, r, delta, friction], rtol=1e-6, atol=1e-9)
         np.testing.assert_allclose(u, [0, force], rtol=1e-6)
         assert PROBLEM.reached(torch.from_numpy(x))
         curves = PROBLEM.equilibrium_curves(torch.tensor(friction, dtype=torch.float64))
         np.testing.assert_allclose(curves, [beta, r, delta], rtol=0, atol=1e-6)
-    knots = np.linspace(*PROBLEM.friction_band, drift.KNOTS)
+    knots = np.linspace(*PROBLEM.friction_band, equilibria.KNOTS)
     # Curvature, and the error with it, falls with friction: the first intervals are the worst.
-    between = ((knots[1:] + knots[:-1]) / 2)[[*range(8), *range(8, drift.KNOTS - 1, 16)]]
-    exact = np.stack([drift.equilibrium(friction)[0] for friction in between])
+    between = ((knots[1:] + knots[:-1]) / 2)[[*range(8), *range(8, equilibria.KNOTS - 1, 16)]]
+    exact = np.stack([equilibria.equilibrium(friction)[0] for friction in between])
     curves = torch.stack(PROBLEM.equilibrium_curves(torch.from_numpy(between)), -1)
     np.testing.assert_allclose(curves, exact[:, [1, 4, 5]] * [-1, 1, 1], rtol=0, atol=1e-6)
 
 
 def test_the_equilibrium_is_open_loop_unstable():
     """Known eigenvalues +2.84 and +0.115 1/s at friction 0.55; the path adds the pair +-i r, held inputs two zeros."""
-    x, u = (torch.from_numpy(entry) for entry in drift.equilibrium(0.55))
+    x, u = (torch.from_numpy(entry) for entry in equilibria.equilibrium(0.55))
     jacobian = torch.autograd.functional.jacobian(lambda state: PROBLEM.drift(state, u), x)
     eigenvalues = sorted(torch.linalg.eigvals(jacobian).tolist(), key=lambda value: -value.real)
     assert eigenvalues[0].real == pytest.approx(2.84, abs=0.005)
@@ -196,7 +196,7 @@ def test_faces(count):
 @pytest.mark.parametrize("problem", [VehicleDrift(), VehicleDrift3()], ids=lambda problem: type(problem).__name__)
 def test_planes(problem):
     """Project undoes embed; embed of the equilibrium's coordinates is the equilibrium, in the target."""
-    center = drift.equilibrium(0.55)[0] if isinstance(problem, VehicleDrift) else problem.equilibrium[0]
+    center = equilibria.equilibrium(0.55)[0] if isinstance(problem, VehicleDrift) else problem.equilibrium[0]
     center = torch.from_numpy(center)
     for plane in problem.planes.values():
         points = plane.box.sample(100, torch.Generator().manual_seed(0), torch.float64)

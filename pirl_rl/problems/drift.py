@@ -8,24 +8,17 @@ u = (delta', F_x): steering rate (rad/s), drive force (N).
 from __future__ import annotations
 
 import math
-from functools import cache
 
-import numpy as np
 import torch
-from scipy.interpolate import CubicSpline
-from scipy.optimize import root
 from torch import Tensor
 
 from pirl_rl.payoffs import Payoff
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems import vehicle
+from pirl_rl.problems.equilibria import CURVATURE, DEGREE, FRICTION_BAND, SPEED, EquilibriumCurves
 from pirl_rl.sets import Box, Plane, band
 
-DEGREE = math.pi / 180
-CURVATURE = 0.600 * math.cos(-20.44 * DEGREE) / 8.0  # 1/m, of the path
-SPEED = 8.0  # m/s, v_x of the equilibria
 FRICTION_RANGE = (0.25, 1.05)
-KNOTS = 513
 
 
 class VehicleDrift(ReachAvoidProblem):
@@ -35,34 +28,25 @@ class VehicleDrift(ReachAvoidProblem):
     states = Box([-2.0, -0.8, 4.0, -8.0, -2.5, -0.7, 0.5], [2.0, 0.8, 12.0, 8.0, 2.5, 0.7, 0.6])
     controls = Box([-1.5, 1000.0], [1.5, 5000.0])
     tolerances = {"e_y": 0.2, "e_psi": 4 * DEGREE, "v_x": 0.5, "beta": 4 * DEGREE, "r": 0.2, "delta": 10 * DEGREE}
-    friction_band = (0.5, 0.6)  # where equilibria are targets
+    friction_band = FRICTION_BAND  # where equilibria are targets
     noise = (0.03, 0.015, 0.20, 0.20, 0.05, 0.01)  # per sqrt(s); friction has none
-    state_names = ("e_y (m)", "e_psi (rad)", "v_x (m/s)", "v_y (m/s)", "r (rad/s)", "delta (rad)", "friction")
-    control_names = ("delta' (rad/s)", "F_x (N)")
 
     def __init__(self, payoff: Payoff | None = None, horizon: float | None = None):
         super().__init__(payoff, horizon)
-        # Solved here: a transform of torch.func, in which the levels may first be asked for, lets nothing out to scipy.
-        table = torch.from_numpy(_equilibrium_table())
-        self._tables: dict[tuple[torch.dtype, torch.device], Tensor] = {(table.dtype, table.device): table}
+        self.equilibrium_curves = EquilibriumCurves()
 
     def drift(self, x: Tensor, u: Tensor) -> Tensor:
         e_y, e_psi, v_x, v_y, r, delta, friction = x.unbind(-1)
         v_x, friction = v_x.clamp(min=vehicle.LEAST_SPEED), friction.clamp(*FRICTION_RANGE)
         delta_rate, demand = u.unbind(-1)
-        drive = vehicle.drive_force(demand.clamp(self.controls.low[1], self.controls.high[1]), friction)
-        sin_delta, cos_delta = delta.sin(), delta.cos()
-        front = vehicle.front_force(v_x, v_y, r, sin_delta / cos_delta, friction)
-        rear = vehicle.rear_force(v_x, v_y, r, friction, drive)
+        demand = demand.clamp(self.controls.low[1], self.controls.high[1])
         sin_psi, cos_psi = e_psi.sin(), e_psi.cos()
         across, along = v_x * sin_psi + v_y * cos_psi, v_x * cos_psi - v_y * sin_psi
         # Rows first: each derivative stays contiguous in memory.
         rates = [
             across,
             r - CURVATURE * along / (1 - CURVATURE * e_y).clamp(min=0.2),
-            (drive - front * sin_delta) / vehicle.MASS + v_y * r,
-            (rear + front * cos_delta) / vehicle.MASS - v_x * r,
-            (vehicle.FRONT_ARM * front * cos_delta - vehicle.REAR_ARM * rear) / vehicle.YAW_INERTIA,
+            *vehicle.accelerations(v_x, v_y, r, delta, friction, demand),
             delta_rate.clamp(self.controls.low[0], self.controls.high[0]),
             torch.zeros_like(friction),
         ]
@@ -110,17 +94,6 @@ class VehicleDrift(ReachAvoidProblem):
         """Friction stays as it is, and no equilibrium is a target outside the band."""
         low, high = self.friction_band
         return (x[..., 6] < low) | (x[..., 6] > high)
-
-    def equilibrium_curves(self, friction: Tensor) -> tuple[Tensor, ...]:
-        """beta, r, delta, each (*), of the equilibrium at friction (*), at the band's edge outside it.
-
-        Linear between knots, to 3e-7: the rear tyre slides in all the band, so the curves are smooth.
-        """
-        low, high = self.friction_band
-        position = ((friction - low) * ((KNOTS - 1) / (high - low))).clamp(0, KNOTS - 1)
-        knot = position.long().clamp(max=KNOTS - 2)
-        table = self._table(friction)
-        return torch.lerp(table[knot], table[knot + 1], (position - knot).unsqueeze(-1)).unbind(-1)
 
     def around_equilibrium(
         self,
@@ -180,12 +153,6 @@ class VehicleDrift(ReachAvoidProblem):
             ),
         }
 
-    def _table(self, like: Tensor) -> Tensor:
-        key = (like.dtype, like.device)
-        if key not in self._tables:
-            self._tables[key] = torch.from_numpy(_equilibrium_table()).to(like)
-        return self._tables[key]
-
     def _target_faces(self, count: int, generator: torch.Generator | None) -> Tensor:
         """Points of the target with one of its six bounded coordinates at its bound."""
         unit = 2 * torch.rand(count, 7, generator=generator, dtype=torch.float64) - 1
@@ -228,40 +195,3 @@ def _drawn(draw, keep, count: int) -> Tensor:
         x = draw(2 * count)
         found = torch.cat([found, x[keep(x)]])
     return found[:count]
-
-
-def equilibrium(friction: float) -> tuple[np.ndarray, np.ndarray]:
-    """The drift equilibrium of one friction: state (7,) and control (2,), to the accuracy of a float64 root.
-
-    v_x = 8 m/s and e_y = 0 are given; beta, r, delta and F_x solve e_psi' = v_x' = v_y' = r' = 0 with e_psi = -beta.
-
-    Raises:
-        ArithmeticError: where the root finder does not converge.
-    """
-    problem = VehicleDrift.__new__(VehicleDrift)  # without the table, which is made of these equilibria
-
-    def point(unknown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        beta, r, delta, force = unknown
-        return np.array([0.0, -beta, SPEED, SPEED * math.tan(beta), r, delta, friction]), np.array([0.0, 1000 * force])
-
-    def residual(unknown: np.ndarray) -> np.ndarray:
-        x, u = (torch.from_numpy(entry) for entry in point(unknown))
-        return problem.drift(x, u)[1:5].numpy()
-
-    start = -20.44 * DEGREE
-    guess = [start, CURVATURE * SPEED / math.cos(start), -12 * DEGREE, 2.293]
-    found = root(residual, guess, method="hybr", tol=1e-14)
-    if np.abs(found.fun).max() > 1e-9:
-        raise ArithmeticError(f"no drift equilibrium found at friction {friction}: residual {found.fun}")
-    return point(found.x)
-
-
-@cache
-def _equilibrium_table() -> np.ndarray:
-    """beta, r, delta of the equilibria at KNOTS equidistant frictions of the band, (KNOTS, 3).
-
-    A spline through every eighth of them: tenths of a second in place of seconds, for an error of 3e-8.
-    """
-    knots = np.linspace(*VehicleDrift.friction_band, KNOTS)
-    solved = np.stack([equilibrium(friction)[0] for friction in knots[::8]])
-    return CubicSpline(knots[::8], solved[:, [1, 4, 5]] * [-1, 1, 1])(knots)

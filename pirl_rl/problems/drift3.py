@@ -16,7 +16,8 @@ from torch import Tensor
 from pirl_rl.payoffs import Payoff
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems import vehicle
-from pirl_rl.problems.drift import DEGREE, SPEED, VehicleDrift
+from pirl_rl.problems.drift import VehicleDrift
+from pirl_rl.problems.equilibria import DEGREE, SPEED
 from pirl_rl.sets import Box, Plane, band
 
 STEERING = -12 * DEGREE  # rad, delta of the published equilibrium
@@ -42,8 +43,6 @@ class VehicleDrift3(ReachAvoidProblem):
     # Per sqrt(s). That of v_y, 0.20 m/s, moves beta = atan2(v_y, v_x) by 0.20 cos(beta)^2 / v_x; it is taken at
     # beta = 0 and the equilibrium's v_x, so that sigma stays constant.
     noise = (0.20 / SPEED, 0.05, 0.20)
-    state_names = ("beta (rad)", "r (rad/s)", "v_x (m/s)")
-    control_names = ("delta (rad)", "F_x (N)")
 
     def __init__(self, payoff: Payoff | None = None, horizon: float | None = None, friction: float = 0.55):
         super().__init__(payoff, horizon)

@@ -53,6 +53,21 @@ def rear_force(v_x: Tensor, v_y: Tensor, r: Tensor, friction: Tensor, drive: Ten
     return fiala(z, z.sign(), REAR_STIFFNESS, sliding)
 
 
+def accelerations(
+    v_x: Tensor, v_y: Tensor, r: Tensor, delta: Tensor, friction: Tensor, demand: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """v_x', v_y' (m/s^2) and r' (rad/s^2) of the single-track model at a demanded drive force (N); v_x > 0."""
+    drive = drive_force(demand, friction)
+    sin, cos = delta.sin(), delta.cos()
+    front = front_force(v_x, v_y, r, sin / cos, friction)
+    rear = rear_force(v_x, v_y, r, friction, drive)
+    return (
+        (drive - front * sin) / MASS + v_y * r,
+        (rear + front * cos) / MASS - v_x * r,
+        (FRONT_ARM * front * cos - REAR_ARM * rear) / YAW_INERTIA,
+    )
+
+
 def drive_force(demand: Tensor, friction: Tensor) -> Tensor:
     """The part of a demanded F_x that the rear tyres transmit, |F_x| <= 0.999 mu F_zr."""
     limit = FRICTION_CIRCLE * REAR_LOAD * friction
