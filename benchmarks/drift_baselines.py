@@ -42,6 +42,8 @@ COLUMNS = {
     "paper_success": "success",
     "fine_mse": "fine: MSE",
     "fine_mse_band": "band",
+    "fine_mse_far": "far",
+    "fine_mse_farthest": "farthest",
     "fine_success": "success",
     "fine_success_band": "band",
     "fine_precision_p50": "precision V > 0.5",
