@@ -22,20 +22,26 @@ class Stage:
         schedule: loss weights by the stage's own updates, from 0.
         initial_states: law of the starts.
         collocation: sampler of the interior points.
+        n_steps: length of returns.
         actor_every: critic updates for each update of the actor and the targets.
+        train_actor: False freezes the actor, so that the critics come to rest at the value of one policy.
     """
 
     updates: float
     schedule: Schedule | None = None
     initial_states: InitialStates | None = None
     collocation: Collocation | None = None
+    n_steps: int | None = None
     actor_every: int | None = None
+    train_actor: bool = True
 
     def __post_init__(self):
         if not self.updates > 0:
             raise ValueError(f"stage.updates: expected a number > 0, got {self.updates}")
-        if self.actor_every is not None and self.actor_every < 1:
-            raise ValueError(f"stage.actor_every: expected at least 1, got {self.actor_every}")
+        for name in ("n_steps", "actor_every"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"stage.{name}: expected at least 1, got {value}")
 
 
 class Curriculum:

@@ -58,6 +58,7 @@ class Learner:
         self.targets = SoftUpdate(loss, tau=polyak)
         self.critic_optimizer = _adam(loss.qvalue_network_params, learning_rate)
         self.actor_optimizer = _adam(loss.actor_network_params, learning_rate)
+        self.train_actor = True
         self.compile = compile
         if compile:
             for name in loss.compilable:
@@ -80,11 +81,12 @@ class Learner:
         self._check(loss, terms, k + 1)
         self._step(self.critic_optimizer, loss)
         if k % self.actor_every == 0:
-            loss_actor, _ = self._evaluate("actor_loss", batch)
-            self._check(loss_actor, {"loss_actor": loss_actor}, k + 1)
-            self._step(self.actor_optimizer, loss_actor)
+            if self.train_actor:
+                loss_actor, _ = self._evaluate("actor_loss", batch)
+                self._check(loss_actor, {"loss_actor": loss_actor}, k + 1)
+                self._step(self.actor_optimizer, loss_actor)
+                self._loss_actor = loss_actor.detach()
             self.targets.step()
-            self._loss_actor = loss_actor.detach()
         return {**terms, "loss_actor": self._loss_actor}
 
     def check_parameters(self, update: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+import torch
 from small import assert_same, at_update, interrupt, resumed, small_trainer
 
 from pirl_rl import checkpoint
@@ -53,7 +54,7 @@ def test_errors(make, message):
 
 STAGES = (
     "stages=[{updates: 1, initial_states: {_target_: pirl_rl.initial_states.UniformStates, low: [0], high: [1]}},"
-    "{updates: 1, actor_every: 5, collocation: {_target_: pirl_rl.collocation.ReplayCollocation, size: 7}}]",
+    "{updates: 1, actor_every: 5, n_steps: 3, collocation: {_target_: pirl_rl.collocation.ReplayCollocation, size: 7}}]",
     "trainer.updates=10",
 )
 
@@ -65,13 +66,14 @@ def test_the_trainer_takes_over_what_a_stage_sets(tmp_path):
 
     def watch(k):
         law = trainer.collector.initial_states.box
-        seen.append((law and law.low, trainer.collocation.size, trainer.learner.actor_every))
+        rates = trainer.collector.n_steps, trainer.learner.actor_every
+        seen.append((law and law.low, trainer.collocation.size, *rates))
         step(k)
 
     trainer.collector.step = watch
     trainer.train()
     size = small_trainer(tmp_path / "other", *STAGES).collocation.size
-    assert seen == [((0.0,), size, 2)] * 5 + [(None, 7, 5)] * 5
+    assert seen == [((0.0,), size, 1, 2)] * 5 + [(None, 7, 3, 5)] * 5
 
 
 def test_resume_inside_a_stage_is_exact(tmp_path):
@@ -84,3 +86,14 @@ def test_resume_inside_a_stage_is_exact(tmp_path):
     ends = [checkpoint.load(tmp_path / name / checkpoint.FOLDER / checkpoint.LAST) for name in ("whole", "cut")]
     assert ends[0]["update"] == 10
     assert_same(*ends)
+
+
+def test_a_frozen_actor_stays_while_critics_and_targets_move(tmp_path):
+    trainer = small_trainer(tmp_path, "stages=[{updates: 1}, {updates: 1, train_actor: false}]", "trainer.updates=10")
+    loss, half = trainer.learner.loss, {}
+    at_update(trainer, 6, lambda: half.update({name: entry.clone() for name, entry in loss.state_dict().items()}))
+    trainer.train()
+    for name, entry in loss.state_dict().items():
+        if name.endswith("weight") and "network" in name:
+            frozen = name.startswith("actor")
+            assert torch.equal(entry, half[name]) == frozen, name

@@ -25,7 +25,19 @@ class TransitionCollector(Protocol):
     """What the trainer asks of a collector; a state is loaded before `start`."""
 
     buffer: TensorDictReplayBuffer
-    initial_states: InitialStates  # a stage of a curriculum sets another one
+
+    @property
+    def initial_states(self) -> InitialStates:
+        """The law of episodes' starts."""
+        ...
+
+    @property
+    def n_steps(self) -> int:
+        """Length of returns."""
+        ...
+
+    def play(self, initial_states: InitialStates, n_steps: int) -> None:
+        """Go on with another law of starts and other returns, as a stage of a curriculum asks."""
 
     def start(self) -> None:
         """Fill the buffer to its warm-up."""

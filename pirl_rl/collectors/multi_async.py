@@ -70,14 +70,17 @@ class MultiAsyncCollector:
 
     @property
     def initial_states(self) -> InitialStates:
-        """The law of episodes' starts; setting another one starts the workers anew."""
         return self._env.initial_states
 
-    @initial_states.setter
-    def initial_states(self, law: InitialStates) -> None:
-        if law is self._env.initial_states:
+    @property
+    def n_steps(self) -> int:
+        return self._transitions.n_steps
+
+    def play(self, initial_states: InitialStates, n_steps: int) -> None:
+        """Where something changes, the workers start anew."""
+        if initial_states is self.initial_states and n_steps == self.n_steps:
             return
-        self._env.initial_states = law
+        self._env.initial_states, self._transitions = initial_states, Transitions(n_steps)
         if self._collector is not None:
             self.close()
             self.start()

@@ -60,12 +60,14 @@ class SyncCollector:
 
     @property
     def initial_states(self) -> InitialStates:
-        """The law of the next episodes' starts."""
         return self.env.initial_states
 
-    @initial_states.setter
-    def initial_states(self, law: InitialStates) -> None:
-        self.env.initial_states = law
+    @property
+    def n_steps(self) -> int:
+        return self._transitions.n_steps
+
+    def play(self, initial_states: InitialStates, n_steps: int) -> None:
+        self.env.initial_states, self._transitions = initial_states, Transitions(n_steps)
 
     def start(self) -> None:
         while len(self.buffer) < min(self.warmup_frames, self.buffer.storage.max_size):
