@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 import sys
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -80,6 +81,8 @@ def _new(folder: Path) -> Iterator[None]:
 
 
 def main() -> None:
+    # Libraries about each other, while they compile: nothing a user could mend.
+    warnings.filterwarnings("ignore", category=FutureWarning, module=r"(torch|tensordict|torchrl)\b")
     arguments = sys.argv[1:]
     resumed = [item for item in arguments if item.startswith("resume=") and item != "resume=null"]
     try:
