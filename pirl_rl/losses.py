@@ -274,7 +274,8 @@ class PIRLLoss(TD3Loss):
         return _masked_mean(value, mask)
 
     def _look_ahead(self, tau: Tensor, x: Tensor) -> Tensor:
-        """Mean V, or its logarithm, at the end of noise-free control steps from tau (N, 1) and x (N, n), or where they meet A or B."""
+        """Mean V, or its logarithm, at the end of noise-free control steps from tau (N, 1) and x (N, n), or where they
+        meet A or B."""
         assert self.simulator is not None
         dt = self.simulator.dt
         for _ in range(self.model_steps):

@@ -54,7 +54,8 @@ def test_errors(make, message):
 
 STAGES = (
     "stages=[{updates: 1, initial_states: {_target_: pirl_rl.initial_states.UniformStates, low: [0], high: [1]}},"
-    "{updates: 1, actor_every: 5, n_steps: 3, collocation: {_target_: pirl_rl.collocation.ReplayCollocation, size: 7}}]",
+    "{updates: 1, actor_every: 5, n_steps: 3, "
+    "collocation: {_target_: pirl_rl.collocation.ReplayCollocation, size: 7}}]",
     "trainer.updates=10",
 )
 

@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from pirl_rl.evaluation.reference_states import GROUPS
 from pirl_rl.evaluation.trajectories import Trajectories
@@ -22,6 +24,8 @@ BINS = 10
 CONTOURS = (0.1, 0.5, 0.9)
 ARROWS = 11
 """Of the vector field, along each axis at most."""
+BEYOND = "0.5"
+"""Where paths leave the box of a plane."""
 ENDS = {"reached": ("o", "limegreen"), "failed": ("X", "red"), "out of time": ("s", "white")}
 STARTS = ("white", "gold", "deepskyblue")
 
@@ -118,7 +122,7 @@ def draw_rollouts(sections: Sequence[Section], paths: Trajectories, values: Sequ
     all_axes = figure.subplots(1, len(sections), squeeze=False)[0]
     for axes, section in zip(all_axes, sections, strict=True):
         mesh = _draw_value(axes, section, section.value)
-        axes.set_facecolor("0.5")  # paths may leave the plane's box
+        axes.set_facecolor(BEYOND)
         projected = section.plane.project(paths.state).numpy()
         for i, end in enumerate(ends):
             line = projected[: paths.steps[i] + 1, i]
@@ -128,10 +132,13 @@ def draw_rollouts(sections: Sequence[Section], paths: Trajectories, values: Sequ
         axes.autoscale()
     figure.colorbar(mesh, ax=list(all_axes), label=f"learned V, τ = {sections[0].tau[0]:g} s")
     starts = zip(STARTS, values, strict=True)
-    handles = [Line2D([], [], color=c, marker="D", mec="black", label=f"from V = {value:.2f}") for c, value in starts]
+    handles: list[Artist] = [
+        Line2D([], [], color=c, marker="D", mec="black", label=f"from V = {value:.2f}") for c, value in starts
+    ]
     handles += [
         Line2D([], [], ls="", marker=marker, color=color, mec="black", label=f"{end}: {ends.count(end)}")
         for end, (marker, color) in ENDS.items()
     ]
+    handles.append(Patch(color=BEYOND, label="beyond the plane"))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize="small", facecolor="0.7")
     return figure
