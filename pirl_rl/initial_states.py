@@ -163,18 +163,17 @@ class VisitedStates:
             return steps, x
         device = generator.device
         start = visited[torch.randint(len(visited), (count,), generator=generator, device=device)]
-        moved = jittered(problem, start, self.radius, generator)
+        near = problem.states.denormalize(moved(problem.states.normalize(start), self.radius, generator))
         taken = torch.rand(count, generator=generator, device=device) < self.share
-        taken = taken & problem.interior(moved) & ~problem.unreachable(moved)
-        return steps, torch.where(taken.unsqueeze(-1), moved, x)
+        taken = taken & problem.interior(near) & ~problem.unreachable(near)
+        return steps, torch.where(taken.unsqueeze(-1), near, x)
 
 
-def jittered(problem: ReachAvoidProblem, x: Tensor, radius: float, generator: torch.Generator) -> Tensor:
-    """States (N, n) moved in random directions of normalised coordinates by lengths uniform in [0, radius]."""
-    direction = torch.randn(x.shape, generator=generator, dtype=x.dtype, device=x.device)
-    length = radius * torch.rand((len(x), 1), generator=generator, dtype=x.dtype, device=x.device)
-    z = problem.states.normalize(x) + length * direction / direction.norm(dim=-1, keepdim=True)
-    return problem.states.denormalize(z)
+def moved(z: Tensor, radius: float, generator: torch.Generator) -> Tensor:
+    """Points (N, d), each moved in a random direction by a length uniform in [0, radius]."""
+    direction = torch.randn(z.shape, generator=generator, dtype=z.dtype, device=z.device)
+    length = radius * torch.rand((len(z), 1), generator=generator, dtype=z.dtype, device=z.device)
+    return z + length * direction / direction.norm(dim=-1, keepdim=True)
 
 
 def _check_tau(tau: str) -> None:

@@ -55,8 +55,6 @@ class PIRLLoss(TD3Loss):
             control is held.
         model_steps: control steps that "model" looks ahead.
         simulator: plays them.
-        value_floor: "model" ascends log(V + value_floor) where it is given: states from which success is still rare, at
-            the edge of the set that the policy has conquered, then weigh as much as others.
         logit_penalty: factor of the mean square of the actor's outputs before their tanh, added to the actor's loss:
             where tanh saturates, no gradient would bring a wrong action back.
         td_weight, hjb_weight, boundary_weight: initial weights of the three terms.
@@ -88,7 +86,6 @@ class PIRLLoss(TD3Loss):
         actor_rule: Literal["q", "hamiltonian", "both", "model"] = "both",
         model_steps: int = 1,
         simulator: Simulator | None = None,
-        value_floor: float | None = None,
         logit_penalty: float = 0.0,
         td_weight: float = 1.0,
         hjb_weight: float = 0.0,
@@ -108,8 +105,6 @@ class PIRLLoss(TD3Loss):
             raise ValueError("loss.td_criterion: 'cross_entropy' needs critics with output 'Sigmoid'")
         if target_critics not in ("min", "mean"):
             raise ValueError(f"loss.target_critics: expected 'min' or 'mean', got {target_critics!r}")
-        if value_floor is not None and not value_floor > 0:
-            raise ValueError(f"loss.value_floor: expected a number > 0, got {value_floor}")
         if model_steps < 1:
             raise ValueError(f"loss.model_steps: expected at least 1, got {model_steps}")
         for critic in critics:
@@ -138,7 +133,7 @@ class PIRLLoss(TD3Loss):
         self.hjb_noise, self.hjb_noise_clip = hjb_noise, hjb_noise_clip
         self.hjb_delta, self.boundary_delta = hjb_delta, boundary_delta
         self.actor_rule, self.model_steps, self.simulator = actor_rule, model_steps, simulator
-        self.value_floor, self.logit_penalty = value_floor, logit_penalty
+        self.logit_penalty = logit_penalty
         self._hamiltonian_operator = generator if has_controlled_noise(problem) else advection
         for name, value in zip(WEIGHTS, (td_weight, hjb_weight, boundary_weight), strict=True):
             self.register_coeff_buffer(name, float(value))
@@ -274,8 +269,7 @@ class PIRLLoss(TD3Loss):
         return _masked_mean(value, mask)
 
     def _look_ahead(self, tau: Tensor, x: Tensor) -> Tensor:
-        """Mean V, or its logarithm, at the end of noise-free control steps from tau (N, 1) and x (N, n), or where they
-        meet A or B."""
+        """Mean V at the end of noise-free control steps from tau (N, 1) and x (N, n), or where they meet A or B."""
         assert self.simulator is not None
         dt = self.simulator.dt
         for _ in range(self.model_steps):
@@ -285,9 +279,7 @@ class PIRLLoss(TD3Loss):
             tau, x = torch.where(live, tau - dt, tau), torch.where(live, moved, x)
         with self.critics("frozen") as critic:
             value = critic(tau, x, self.act(tau, x).detach()).mean(0).squeeze(-1)
-        value = torch.where(self.problem.reached(x), torch.ones_like(value), value)
-        # A critic without an output layer may be below zero.
-        return value.mean() if self.value_floor is None else (value.clamp(min=0) + self.value_floor).log().mean()
+        return torch.where(self.problem.reached(x), torch.ones_like(value), value).mean()
 
     @staticmethod
     def _clipped_noise(like: Tensor, deviation: float, bound: float) -> Tensor:

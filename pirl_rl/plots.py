@@ -151,10 +151,15 @@ def draw_training(metrics: dict[str, np.ndarray]) -> Figure:
     _curves(middle, metrics, HELD_OUT, "Held-out losses", marker=".")
     _curves(bottom, metrics, WEIGHTS, "Loss weights")
     for axes in (top, middle):
-        axes.set_ylabel("mean square")
+        axes.set_ylabel("loss")
         log_scale(axes, "y", [value for line in axes.lines for value in line.get_ydata()])  # type: ignore[union-attr]
     bottom.set(xlabel="update", ylabel="weight")
     bottom.set_ylim(bottom=0)
+    if "stage" in metrics:
+        for update in metrics["update"][1:][np.diff(metrics["stage"]) != 0]:
+            for axes in (top, middle, bottom):
+                axes.axvline(update, color="0.4", ls=":")
+        bottom.set_xlabel("update; dotted: a stage begins")
     return figure
 
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from pirl_rl.evaluation.monte_carlo import Policy
 from pirl_rl.evaluation.trajectories import closed_loop
 from pirl_rl.files import replacing
-from pirl_rl.initial_states import InitialStates
+from pirl_rl.initial_states import InitialStates, moved
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sets import Box
 from pirl_rl.simulator import Simulator
@@ -69,11 +69,11 @@ class ReferenceStates:
         """
         if not 1 <= neighbours <= len(x):
             raise ValueError(f"neighbours: expected 1 to {len(x)}, the number of visited states, got {neighbours}")
-        moved_tau, moved_x = displaced(problem, tau, x, box, generator, count, radius)
-        visited, moved = box.normalize(_joined(tau, x)), box.normalize(_joined(moved_tau, moved_x))
-        distance = torch.cat([_mean_nearest(part, visited, neighbours) for part in moved.split(CHUNK)])
+        new_tau, new_x = displaced(problem, tau, x, box, generator, count, radius)
+        visited, new = box.normalize(_joined(tau, x)), box.normalize(_joined(new_tau, new_x))
+        distance = torch.cat([_mean_nearest(part, visited, neighbours) for part in new.split(CHUNK)])
         rank = distance.argsort().argsort()
-        return cls(moved_tau, moved_x, distance, rank * len(GROUPS) // len(rank))
+        return cls(new_tau, new_x, distance, rank * len(GROUPS) // len(rank))
 
     def save(self, path: str | Path) -> None:
         """Write what `load` reads, in single precision."""
@@ -96,14 +96,10 @@ def displaced(
     uniform in [0, radius] and clipped to the box; those in A or B or with tau = 0 are dropped."""
     if box.dim != x.shape[-1] + 1:
         raise ValueError(f"box: expected {x.shape[-1] + 1} axes, tau first, got {box.dim}")
-    like = {"dtype": x.dtype, "device": x.device, "generator": generator}
     # Without repetition as long as there are enough.
     order = [torch.randperm(len(x), generator=generator, device=x.device) for _ in range(-(-count // len(x)))]
     chosen = torch.cat(order)[:count]
-    z = box.normalize(_joined(tau[chosen], x[chosen]))
-    direction = torch.randn(z.shape, **like)
-    length = radius * torch.rand((count, 1), **like)
-    z = (z + length * direction / direction.norm(dim=-1, keepdim=True)).clamp(-1, 1)
+    z = moved(box.normalize(_joined(tau[chosen], x[chosen])), radius, generator).clamp(-1, 1)
     tau, x = (point := box.denormalize(z))[:, 0], point[:, 1:]
     kept = problem.interior(x) & (tau > 0)
     return tau[kept], x[kept]

@@ -28,6 +28,8 @@ class VehicleDrift(ReachAvoidProblem):
     states = Box([-2.0, -0.8, 4.0, -8.0, -2.5, -0.7, 0.5], [2.0, 0.8, 12.0, 8.0, 2.5, 0.7, 0.6])
     controls = Box([-1.5, 1000.0], [1.5, 5000.0])
     tolerances = {"e_y": 0.2, "e_psi": 4 * DEGREE, "v_x": 0.5, "beta": 4 * DEGREE, "r": 0.2, "delta": 10 * DEGREE}
+    limits = {"e_y": 2.0, "e_psi": 0.8, "v_y": 12.0, "r": 2.5, "delta": 0.7}  # of absolute values, outside of B
+    speeds = (3.0, 25.0)  # m/s, of v_x outside of B
     friction_band = FRICTION_BAND  # where equilibria are targets
     noise = (0.03, 0.015, 0.20, 0.20, 0.05, 0.01)  # per sqrt(s); friction has none
 
@@ -75,15 +77,15 @@ class VehicleDrift(ReachAvoidProblem):
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
         e_y, e_psi, v_x, v_y, r, delta, friction = x.unbind(-1)
-        low, high = FRICTION_RANGE
+        limits, (slow, fast), (low, high) = self.limits, self.speeds, FRICTION_RANGE
         bounds = [
-            2.0 - e_y.abs(),
-            0.8 - e_psi.abs(),
-            v_x - 3.0,
-            25.0 - v_x,
-            12.0 - v_y.abs(),
-            2.5 - r.abs(),
-            0.7 - delta.abs(),
+            limits["e_y"] - e_y.abs(),
+            limits["e_psi"] - e_psi.abs(),
+            v_x - slow,
+            fast - v_x,
+            limits["v_y"] - v_y.abs(),
+            limits["r"] - r.abs(),
+            limits["delta"] - delta.abs(),
             v_x - v_y.abs(),  # a sideslip angle beta of 45 degrees
             friction - low,
             high - friction,
@@ -172,9 +174,9 @@ class VehicleDrift(ReachAvoidProblem):
         x = self.states.sample(count, generator, dtype=torch.float64)
         side = torch.randint(5, (count,), generator=generator)
         sign = torch.where(torch.rand(count, generator=generator, dtype=torch.float64) < 0.5, -1.0, 1.0).double()
-        for index, (column, bound) in enumerate(((0, 2.0), (1, 0.8), (4, 2.5))):
-            x[:, column] = torch.where(side == index, sign * bound, x[:, column])
-        x[:, 2] = torch.where(side == 3, torch.full_like(sign, 3.0), x[:, 2])
+        for index, (column, name) in enumerate(((0, "e_y"), (1, "e_psi"), (4, "r"))):
+            x[:, column] = torch.where(side == index, sign * self.limits[name], x[:, column])
+        x[:, 2] = torch.where(side == 3, torch.full_like(sign, self.speeds[0]), x[:, 2])
         x[:, 3] = torch.where(side == 4, sign * x[:, 2], x[:, 3])
         return x
 

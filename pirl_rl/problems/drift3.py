@@ -42,7 +42,7 @@ class VehicleDrift3(ReachAvoidProblem):
     tolerances = {name: VehicleDrift.tolerances[name] for name in ("beta", "r", "v_x")}
     # Per sqrt(s). That of v_y, 0.20 m/s, moves beta = atan2(v_y, v_x) by 0.20 cos(beta)^2 / v_x; it is taken at
     # beta = 0 and the equilibrium's v_x, so that sigma stays constant.
-    noise = (0.20 / SPEED, 0.05, 0.20)
+    noise = (VehicleDrift.noise[3] / SPEED, VehicleDrift.noise[4], VehicleDrift.noise[2])
 
     def __init__(self, payoff: Payoff | None = None, horizon: float | None = None, friction: float = 0.55):
         super().__init__(payoff, horizon)
@@ -77,7 +77,8 @@ class VehicleDrift3(ReachAvoidProblem):
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
         beta, r, v_x = x.unbind(-1)
-        bounds = [math.pi / 4 - beta.abs(), 2.5 - r.abs(), v_x - 3.0, 25.0 - v_x]
+        slow, fast = VehicleDrift.speeds
+        bounds = [math.pi / 4 - beta.abs(), VehicleDrift.limits["r"] - r.abs(), v_x - slow, fast - v_x]
         return torch.stack(bounds).movedim(0, -1)
 
     @property
