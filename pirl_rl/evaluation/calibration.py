@@ -7,6 +7,7 @@ from typing import Literal
 
 import torch
 
+from pirl_rl.evaluation.evidence import generator_like, points_generator
 from pirl_rl.evaluation.monte_carlo import mean_payoff
 from pirl_rl.initial_states import InitialStates, UniformStates
 from pirl_rl.simulator import Simulator
@@ -45,12 +46,12 @@ class Calibration:
 
     def __call__(self, solution: Solution) -> dict[str, float]:
         """calibration_mse, calibration_mae, and calibration_noise, the part of the former that is Monte Carlo's own."""
-        problem, generator = solution.problem, torch.Generator().manual_seed(self.seed)
+        problem, generator = solution.problem, points_generator(self.seed)
         _, x = self.initial_states.sample(problem, self.points, 1, generator, solution.dtype)
         x = x.to(solution.device)
         late = 1 - torch.rand(self.points, generator=generator, dtype=solution.dtype)
         tau = problem.horizon * late.to(solution.device)
-        noise = torch.Generator(solution.device).manual_seed(self.seed)
+        noise = generator_like(solution, self.seed)
         mean = mean_payoff(self.simulator(problem), solution.policy, tau, x, self.rollouts, noise)
         error = solution.value(tau, x) - mean
         return {

@@ -12,6 +12,9 @@ from torch import Tensor
 
 from pirl_rl.solution import Solution
 
+POINTS = 1_000_003
+"""Keeps the seeds of points apart from those of noise; of a larger number torch would see the lowest 32 bits only."""
+
 
 class Evidence(Protocol):
     """What was measured, as arrays."""
@@ -48,6 +51,12 @@ def draw_evidence(evaluators: Iterable[object]) -> dict[str, Figure]:
 def like(solution: Solution, *tensors: Tensor) -> tuple[Tensor, ...]:
     """Tensors in a solution's dtype, on its device."""
     return tuple(tensor.to(solution.device, solution.dtype) for tensor in tensors)
+
+
+def points_generator(seed: int) -> torch.Generator:
+    """A source of points and starts, on the CPU, independent of the noise of the same seed: were both drawn from one
+    stream, a path's noise would follow from its start."""
+    return torch.Generator().manual_seed(POINTS + seed)
 
 
 def generator_like(solution: Solution, seed: int) -> torch.Generator:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pirl_rl.collocation import BoundarySampler, Collocation
-from pirl_rl.evaluation.evidence import like
+from pirl_rl.evaluation.evidence import generator_like, like, points_generator
 from pirl_rl.evaluation.reference_states import ReferenceStates
 from pirl_rl.initial_states import UniformStates
 from pirl_rl.simulator import Simulator, exit_value
@@ -55,7 +55,7 @@ class Residuals:
         self.simulator = partial(Simulator, dt=dt, substeps=substeps, crossing=crossing)
 
     def __call__(self, solution: Solution) -> dict[str, float]:
-        generator = torch.Generator().manual_seed(self.seed)
+        generator = points_generator(self.seed)
         tau, x = self._interior(solution, generator)
         along, largest = self._hjb(solution, tau, x)
         losses = {
@@ -100,7 +100,7 @@ class Residuals:
         max_steps = round(problem.horizon / simulator.dt)
         steps, x = UniformStates().sample(problem, self.points, max_steps, generator, solution.dtype)
         tau, tau_next, x = like(solution, steps * simulator.dt, (steps - 1) * simulator.dt, x)
-        noise = torch.Generator(solution.device).manual_seed(self.seed)
+        noise = generator_like(solution, self.seed)
         step = simulator.step(x, solution.policy(tau, x), noise)
         ended = step.reached | step.failed | (steps == 1).to(solution.device)
         target = torch.where(ended, exit_value(problem, step), solution.raw_value(tau_next, step.state))

@@ -9,6 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from pirl_rl.evaluation.evidence import points_generator
 from pirl_rl.evaluation.monte_carlo import Policy, mean_payoff, wilson_interval
 from pirl_rl.initial_states import InitialStates, UniformStates
 from pirl_rl.payoffs import Indicator
@@ -45,7 +46,7 @@ class Success:
 
     def __call__(self, solution: Solution) -> dict[str, float]:
         """success_rate with its 95% interval (success_low, success_high), reward, and if known optimal_reward."""
-        problem, generator = solution.problem, torch.Generator().manual_seed(self.seed)
+        problem, generator = solution.problem, points_generator(self.seed)
         dt = self.simulator(problem).dt
         max_steps = round(problem.horizon / dt)
         steps, x = self.initial_states.sample(problem, self.episodes, max_steps, generator, solution.dtype)
