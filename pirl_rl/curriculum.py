@@ -24,6 +24,7 @@ class Stage:
         collocation: sampler of the interior points.
         n_steps: length of returns.
         actor_every: critic updates for each update of the actor and the targets.
+        model_steps: control steps that the actor's rule "model" looks ahead.
         train_actor: False freezes the actor, so that the critics come to rest at the value of one policy.
     """
 
@@ -33,12 +34,13 @@ class Stage:
     collocation: Collocation | None = None
     n_steps: int | None = None
     actor_every: int | None = None
+    model_steps: int | None = None
     train_actor: bool = True
 
     def __post_init__(self):
         if not self.updates > 0:
             raise ValueError(f"stage.updates: expected a number > 0, got {self.updates}")
-        for name in ("n_steps", "actor_every"):
+        for name in ("n_steps", "actor_every", "model_steps"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"stage.{name}: expected at least 1, got {value}")

@@ -93,7 +93,8 @@ class Trainer:
                 raise ValueError(f"trainer.{name}: expected an integer >= {least}, got {value!r}")
         self.learner, self.collector, self.collocation, self.boundary = learner, collector, collocation, boundary
         self.stages = stages
-        self._unstaged = collector.initial_states, collector.n_steps, collocation, learner.actor_every
+        actor = learner.actor_every, learner.loss.model_steps
+        self._unstaged = collector.initial_states, collector.n_steps, collocation, *actor
         self.updates, self.batch_size = updates, batch_size
         self.log_every, self.evaluate_every, self.checkpoint_every = log_every, evaluate_every, checkpoint_every
         self.during, self.final = tuple(during), tuple(final)
@@ -154,10 +155,11 @@ class Trainer:
         if self.stages is None:
             return
         stage = self.stages.stages[self.stages.index(self.update)]
-        initial_states, n_steps, collocation, actor_every = self._unstaged
+        initial_states, n_steps, collocation, actor_every, model_steps = self._unstaged
         self.collector.play(stage.initial_states or initial_states, stage.n_steps or n_steps)
         self.collocation = stage.collocation or collocation
         self.learner.actor_every, self.learner.train_actor = stage.actor_every or actor_every, stage.train_actor
+        self.learner.loss.model_steps = stage.model_steps or model_steps
 
     def sample(self) -> TensorDict:
         """The batch of one update; a term of negligible weight is left out of the work."""

@@ -54,7 +54,7 @@ def test_errors(make, message):
 
 STAGES = (
     "stages=[{updates: 1, initial_states: {_target_: pirl_rl.initial_states.UniformStates, low: [0], high: [1]}},"
-    "{updates: 1, actor_every: 5, n_steps: 3, "
+    "{updates: 1, actor_every: 5, n_steps: 3, model_steps: 4, "
     "collocation: {_target_: pirl_rl.collocation.ReplayCollocation, size: 7}}]",
     "trainer.updates=10",
 )
@@ -67,14 +67,14 @@ def test_the_trainer_takes_over_what_a_stage_sets(tmp_path):
 
     def watch(k):
         law = trainer.collector.initial_states.box
-        rates = trainer.collector.n_steps, trainer.learner.actor_every
+        rates = trainer.collector.n_steps, trainer.learner.actor_every, trainer.learner.loss.model_steps
         seen.append((law and law.low, trainer.collocation.size, *rates))
         step(k)
 
     trainer.collector.step = watch
     trainer.train()
     size = small_trainer(tmp_path / "other", *STAGES).collocation.size
-    assert seen == [((0.0,), size, 1, 2)] * 5 + [(None, 7, 3, 5)] * 5
+    assert seen == [((0.0,), size, 1, 2, 1)] * 5 + [(None, 7, 3, 5, 4)] * 5
 
 
 def test_resume_inside_a_stage_is_exact(tmp_path):
