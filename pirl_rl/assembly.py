@@ -135,6 +135,34 @@ def restore(trainer: Trainer) -> None:
         raise ConfigError(f"trainer.updates: {trainer.folder} has done {trainer.update} already, got {trainer.updates}")
 
 
+def begin(trainer: Trainer, start: str) -> Path:
+    """Give a new trainer the networks and targets of another run, and from a `last.pt` its optimisers and transitions.
+
+    The transitions of a run that collapsed are those of spoilt networks: they stay behind.
+
+    Args:
+        trainer: fresh; keeps its own seeds and counts its own updates.
+        start: a run directory, of which the newest checkpoint is taken, or a file of its `checkpoints/`.
+
+    Returns:
+        The checkpoint's file, absolute.
+
+    Raises:
+        CheckpointError: none there, a broken one, or one of another configuration.
+    """
+    path = checkpoint.newest(Path(start)) if Path(start).is_dir() else Path(start)
+    state = checkpoint.load(path)
+    with fitting(path):
+        if "learner" in state:
+            trainer.learner.load_state_dict(state["learner"])
+        else:
+            trainer.learner.loss.load_state_dict(checkpoint.loss_state(state))
+        collapsed = (state.get("rollback") or {}).get("collapsed_at") is not None
+        trainer.collector.begin(state["collector"]["buffer"] if "collector" in state and not collapsed else None)
+    trainer.learner.check_parameters(0)
+    return path.absolute()
+
+
 @contextmanager
 def fitting(path: Path) -> Iterator[None]:
     """Whatever does not fit while a checkpoint is loaded is told as such."""

@@ -1,4 +1,6 @@
-"""Train: `python -m pirl_rl.train +experiment=reach1d [method=...] [key=value ...]`, or `resume=RUN_DIR`."""
+"""Train: `python -m pirl_rl.train +experiment=reach1d [method=...] [start=CHECKPOINT] [key=value ...]`, or
+`resume=RUN_DIR`.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from pirl_rl import checkpoint
-from pirl_rl.assembly import make_trainer, restore
+from pirl_rl.assembly import begin, make_trainer, restore
 from pirl_rl.configuration import CONF, ConfigError, load_config, save_config
 from pirl_rl.console import INTERRUPTED, named_modules, override, table, told
 from pirl_rl.loggers import METRICS_FILE
@@ -33,6 +35,11 @@ def train(config: DictConfig) -> float:
         # What the user types is trusted; what a directory from elsewhere says is not.
         trust = [*config.trust, *named_modules(hydra_config.overrides.task)]
         trainer = make_trainer(config, folder, trust)
+        if config.start is not None:
+            # On record as a file wherever one stands: what was typed may be relative, or a run that goes on.
+            if not isinstance(config.start, str):
+                raise ConfigError(f"start: expected the path of a run or a checkpoint, got {config.start!r}")
+            config.start = str(begin(trainer, config.start))
         save_config(config, folder)
         OmegaConf.save(hydra_config.overrides.task, folder / ".hydra" / "overrides.yaml")
         summary = _train(trainer)
@@ -46,6 +53,8 @@ def resume(folder: Path, overrides: Sequence[str]) -> None:
         refuse_links(folder)
         config.trust = []
         for text in overrides:
+            if text.startswith("start="):
+                raise ConfigError(f"{text}: the run has begun already; a new run starts from there, without resume")
             override(config, text)
         trainer = make_trainer(config, folder, [*config.trust, *named_modules(overrides)])
         restore(trainer)

@@ -4,32 +4,26 @@ from __future__ import annotations
 
 import json
 import math
-import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDict
-from tqdm import tqdm
 
 from pirl_rl import checkpoint
 from pirl_rl.collectors import TransitionCollector
 from pirl_rl.collocation import BoundarySampler, Collocation
 from pirl_rl.curriculum import Curriculum
-from pirl_rl.evaluation import evaluate
+from pirl_rl.evaluation import Evaluator, Success, evaluate
 from pirl_rl.files import replacing
+from pirl_rl.guard import Rollback
 from pirl_rl.learner import DivergenceError, Learner
 from pirl_rl.loggers import MetricsLogger, NoLogger
+from pirl_rl.progress import Progress, interruptible
 from pirl_rl.solution import Solution
-
-Evaluator = Callable[[Solution], dict[str, float]]
-EVALUATED = ("value_mse", "success_rate", "calibration_mse", "hjb_loss", "td_loss")
-TRAINED = ("train_td_loss", "train_hjb_loss", "train_boundary_loss")
-"""What the progress shows, of an evaluation and between evaluations."""
 
 NEGLIGIBLE = 1e-6
 """Weights below this share of their largest of the run, as a sigmoid has far from its center, are taken for zero."""
@@ -56,6 +50,7 @@ class Trainer:
         log_every: updates between rows of metrics.
         evaluate_every: updates between evaluations during training; 0 for none.
         checkpoint_every: updates between checkpoints; 0 for the last one only.
+        rollback: end the run where training collapses, with the networks of the last good evaluation; see `Guard`.
         during, final: evaluators during and after training.
         logger: where rows go.
         folder: the run directory; None keeps everything in memory.
@@ -75,6 +70,7 @@ class Trainer:
         log_every: int = 100,
         evaluate_every: int = 2_000,
         checkpoint_every: int = 5_000,
+        rollback: bool = False,
         during: Sequence[Evaluator] = (),
         final: Sequence[Evaluator] = (),
         logger: MetricsLogger | None = None,
@@ -105,7 +101,18 @@ class Trainer:
         self.rng = torch.Generator(self.solution.device).manual_seed(seed)
         weights = [learner.schedule(k) for k in (*range(0, updates, max(1, updates // 1_000)), updates)]
         self.largest = tuple(max(values) for values in zip(*weights, strict=True))
+        self.rollback = self._make_rollback() if rollback else None
         self.update, self.saved, self.wall_seconds = 0, 0, 0.0
+
+    def _make_rollback(self) -> Rollback:
+        success = next((one for one in self.during if isinstance(one, Success)), None)
+        if success is None or not self.evaluate_every:
+            raise ValueError(
+                "trainer.rollback: it judges evaluations during training, expected trainer.evaluate_every >= 1 and "
+                f"success in evaluation.during, got {self.evaluate_every} and "
+                f"{[type(one).__name__ for one in self.during]}"
+            )
+        return Rollback(self.learner, success)
 
     def train(self) -> dict[str, float]:
         """Run to the last update; returns the summary.
@@ -118,10 +125,8 @@ class Trainer:
             self.logger.open(self.folder, self.config)
             self.logger.rewind(self.update)
         try:
-            with _interruptible() as interrupted:
-                self._begin_stage()
-                self.collector.start()
-                self._loop(interrupted)
+            if self.rollback is None or self.rollback.collapsed_at is None:
+                self._run()
         except DivergenceError as error:
             kept = f"the checkpoint of update {self.saved} is kept" if self.saved else "there is no checkpoint yet"
             raise DivergenceError(f"{error}; {kept}") from None
@@ -130,9 +135,32 @@ class Trainer:
             self.logger.close()
         return self._finish()
 
+    def _run(self) -> None:
+        with interruptible() as interrupted:
+            self._begin_stage()
+            if self.rollback is not None and self.rollback.good_at is None:
+                self.rollback.judge(self.update)
+            self.collector.start()
+            try:
+                self._loop(interrupted)
+            except DivergenceError as error:
+                if self.rollback is None:
+                    raise
+                self._roll_back(self.rollback, str(error))
+
+    def _roll_back(self, rollback: Rollback, reason: str) -> None:
+        rollback.restore(self.update)
+        self.save()
+        print(
+            f"training collapsed at update {self.update}: {reason}; the networks of update {rollback.good_at} are "
+            "back, and the run ends with them",
+            file=sys.stderr,
+            flush=True,
+        )
+
     def _loop(self, interrupted: Callable[[], bool]) -> None:
         begin = time.perf_counter() - self.wall_seconds
-        with _Progress(self.updates, self.update) as progress:
+        with Progress(self.updates, self.update) as progress:
             for k in range(self.update, self.updates):
                 if self.stages is not None and self.stages.begins(k):
                     self._begin_stage()
@@ -143,6 +171,8 @@ class Trainer:
                 if row:
                     self.logger.log(row)
                 progress.show(self.update, row)
+                if self.rollback is not None and ("success_rate" in row or self.update == self.updates):
+                    self.rollback.judge(self.update, row)
                 stop = interrupted() and self.update < self.updates
                 due = bool(self.checkpoint_every) and self.update % self.checkpoint_every == 0
                 if due or stop or self.update == self.updates:
@@ -192,7 +222,8 @@ class Trainer:
         summary = {
             "updates": self.update,
             "wall_seconds": self.wall_seconds,
-            "updates_per_second": self.update / self.wall_seconds,
+            "updates_per_second": self.update / self.wall_seconds if self.update else 0.0,
+            **({} if self.rollback is None else self.rollback.summary()),
             **evaluate(self.solution, self.final),
         }
         if self.folder is not None:
@@ -223,6 +254,7 @@ class Trainer:
             "wall_seconds": self.wall_seconds,
             "learner": self.learner.state_dict(),
             "collector": self.collector.state_dict(),
+            "rollback": None if self.rollback is None else self.rollback.state_dict(),
             "rng": self.rng.get_state(),
             "torch_rng": torch.get_rng_state(),
             "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
@@ -233,56 +265,9 @@ class Trainer:
         self.update, self.saved, self.wall_seconds = state["update"], state["update"], state["wall_seconds"]
         self.learner.load_state_dict(state["learner"])
         self.collector.load_state_dict(state["collector"])
+        if self.rollback is not None and state.get("rollback") is not None:
+            self.rollback.load_state_dict(state["rollback"])
         self.rng.set_state(state["rng"])
         torch.set_rng_state(state["torch_rng"])
         if state["cuda_rng"] and torch.cuda.is_available():
             torch.cuda.set_rng_state_all(state["cuda_rng"])
-
-
-class _Progress:
-    """A bar on a terminal; elsewhere plain lines, at each evaluation and each tenth of the run."""
-
-    def __init__(self, total: int, done: int):
-        self.bar = tqdm(total=total, initial=done, unit="update", disable=None, dynamic_ncols=True)
-        self.total, self.shown = total, done
-
-    def show(self, update: int, row: Mapping[str, float]) -> None:
-        if not self.bar.disable:
-            self.bar.update(update - self.bar.n)
-        evaluated = any(name in row for name in EVALUATED)
-        names = EVALUATED if evaluated else TRAINED
-        text = ", ".join(f"{name} {row[name]:.3g}" for name in names if not math.isnan(row.get(name, math.nan)))
-        if not self.bar.disable:
-            if evaluated or (row and not self.bar.postfix):
-                self.bar.set_postfix_str(text)
-        elif evaluated or (row and update - self.shown >= self.total / 10):
-            print(f"update {update}/{self.total}: {text}", file=sys.stderr, flush=True)
-            self.shown = update
-
-    def __enter__(self) -> _Progress:
-        return self
-
-    def __exit__(self, *exception) -> None:
-        self.bar.close()
-
-
-@contextmanager
-def _interruptible() -> Iterator[Callable[[], bool]]:
-    """SIGINT raises a flag instead of an exception, so that the loop ends between two updates; a second one kills."""
-    asked = False
-
-    def ask(number, frame):
-        nonlocal asked
-        asked = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        print("\nstopping after this update; Ctrl-C again stops at once", file=sys.stderr, flush=True)
-
-    try:
-        previous = signal.signal(signal.SIGINT, ask)
-    except ValueError:  # not in the main thread: nobody sends us signals there
-        yield lambda: False
-        return
-    try:
-        yield lambda: asked
-    finally:
-        signal.signal(signal.SIGINT, previous)

@@ -22,7 +22,7 @@ logging.getLogger("torchrl").setLevel(logging.WARNING)
 
 
 class TransitionCollector(Protocol):
-    """What the trainer asks of a collector; a state is loaded before `start`."""
+    """What the trainer asks of a collector; a state is loaded, or begun with, before `start`."""
 
     buffer: TensorDictReplayBuffer
 
@@ -38,6 +38,10 @@ class TransitionCollector(Protocol):
 
     def play(self, initial_states: InitialStates, n_steps: int) -> None:
         """Go on with another law of starts and other returns, as a stage of a curriculum asks."""
+
+    def begin(self, buffer: dict[str, Any] | None) -> None:
+        """Begin a run with a trained actor: with the transitions of another collector's `buffer` state, if any, and a
+        warm-up, if any is still needed, in which the actor plays in place of random actions."""
 
     def start(self) -> None:
         """Fill the buffer to its warm-up."""

@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
+from pirl_rl.collectors.transitions import TRANSITION
 from pirl_rl.envs import ReachAvoidEnv
 
 
@@ -49,6 +50,27 @@ def buffer_state(buffer: TensorDictReplayBuffer, rng: torch.Generator) -> dict[s
         "writer": buffer.writer.state_dict(),
         "rng": rng.get_state(),
     }
+
+
+def fill_buffer(
+    buffer: TensorDictReplayBuffer, device: torch.device, env: ReachAvoidEnv, state: dict[str, Any]
+) -> None:
+    """Put the transitions of another buffer's state into an empty one, oldest first; the newest where it is smaller.
+
+    Raises:
+        ValueError: they are not those of such an environment.
+    """
+    if not state["transitions"]:
+        return
+    transitions = TensorDict(state["transitions"]).auto_batch_size_(1)
+    example = env.fake_tensordict().select(*TRANSITION)
+    for key in TRANSITION:
+        got, expected = (entry.get(key).shape[1:] for entry in (transitions, example))
+        if got != expected:
+            raise ValueError(f"replay buffer, {key}: expected shape {tuple(expected)}, got {tuple(got)}")
+    count, size = len(transitions), buffer.storage.max_size
+    order = (torch.arange(count) + state["writer"]["_cursor"]) % count  # a full buffer was written around its end
+    buffer.extend(transitions.select(*TRANSITION)[order[-size:]].to(device))
 
 
 def load_buffer(buffer: TensorDictReplayBuffer, rng: torch.Generator, state: dict[str, Any]) -> None:

@@ -16,7 +16,7 @@ import torch
 from torchrl import collectors as torchrl_collectors
 from torchrl.weight_update import SharedMemWeightSyncScheme
 
-from pirl_rl.collectors.buffers import buffer_state, check_sizes, load_buffer, make_buffer
+from pirl_rl.collectors.buffers import buffer_state, check_sizes, fill_buffer, load_buffer, make_buffer
 from pirl_rl.collectors.transitions import Exploration, Transitions, exploring_policy
 from pirl_rl.envs import ReachAvoidEnv
 from pirl_rl.initial_states import InitialStates
@@ -61,7 +61,7 @@ class MultiAsyncCollector:
         self.updates_per_batch, self.warmup_frames, self.patience = updates_per_batch, warmup_frames, patience
         self.buffer, self._rng = make_buffer(buffer_size, torch.device("cpu"), seed, shared=True)
         self._actor, self._seed, self._exploration = actor, seed, Exploration(exploration_noise, exploration)
-        self._env, self._workers = env, workers
+        self._env, self._workers, self._random_warmup = env, workers, True
         self._frames_per_batch, self._transitions = frames_per_batch, Transitions(n_steps)
         self._collector: Any = None
         storage: Any = self.buffer.storage
@@ -85,6 +85,11 @@ class MultiAsyncCollector:
             self.close()
             self.start()
 
+    def begin(self, buffer: dict[str, Any] | None) -> None:
+        self._random_warmup = False
+        if buffer is not None:
+            fill_buffer(self.buffer, self._rng.device, self._env, buffer)
+
     def start(self) -> None:
         # A start in the middle of a run is not to repeat the noise of the one before.
         seeds = range(first := self._seed + 1 + self.buffer.write_count, first + self._workers)
@@ -99,7 +104,7 @@ class MultiAsyncCollector:
                 self._policy,
                 frames_per_batch=self._frames_per_batch,
                 total_frames=-1,
-                init_random_frames=max(0, self.warmup_frames - self.buffer.write_count),
+                init_random_frames=max(0, self.warmup_frames - self.buffer.write_count) * self._random_warmup,
                 replay_buffer=self.buffer,
                 postproc=self._transitions,
                 auto_register_policy_transforms=False,

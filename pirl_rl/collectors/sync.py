@@ -7,7 +7,7 @@ from typing import Any, Literal
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 
-from pirl_rl.collectors.buffers import buffer_state, check_sizes, load_buffer, make_buffer
+from pirl_rl.collectors.buffers import buffer_state, check_sizes, fill_buffer, load_buffer, make_buffer
 from pirl_rl.collectors.transitions import Exploration, Transitions, exploring_policy
 from pirl_rl.envs import ReachAvoidEnv
 from pirl_rl.initial_states import InitialStates
@@ -22,7 +22,7 @@ class SyncCollector:
         actor: the learner's own, its parameters followed live.
         frames_per_batch: transitions a batch, a multiple of the environment's batch size.
         updates_per_batch: updates between two batches.
-        warmup_frames: transitions of uniformly random actions before the first update.
+        warmup_frames: transitions before the first update, of uniformly random actions; of the actor after `begin`.
         buffer_size: capacity of the replay buffer.
         exploration_noise: deviation of the noise on actions.
         exploration: when there is noise, "always" or at the "start" of episodes, see `Exploration`.
@@ -69,6 +69,12 @@ class SyncCollector:
     def play(self, initial_states: InitialStates, n_steps: int) -> None:
         self.env.initial_states, self._transitions = initial_states, Transitions(n_steps)
 
+    def begin(self, buffer: dict[str, Any] | None) -> None:
+        if buffer is not None:
+            fill_buffer(self.buffer, self._rng.device, self.env, buffer)
+        # TorchRL's collector then takes its random frames for played; the count is part of the state.
+        self._load_frames(self._collector.init_random_frames)
+
     def start(self) -> None:
         while len(self.buffer) < min(self.warmup_frames, self.buffer.storage.max_size):
             self._collect()
@@ -91,9 +97,12 @@ class SyncCollector:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         load_buffer(self.buffer, self._rng, state["buffer"])
         # TorchRL saves no environment state; the carried TensorDict is all that a ReachAvoidEnv has.
-        self._collector.load_state_dict({**self._collector.state_dict(), "frames": state["frames"]})  # type: ignore[arg-type]
+        self._load_frames(state["frames"])
         self._collector._carrier.update(TensorDict(state["carrier"], device=self.env.device))
         self.env.rng.set_state(state["env_rng"])
+
+    def _load_frames(self, frames: int) -> None:
+        self._collector.load_state_dict({**self._collector.state_dict(), "frames": frames})  # type: ignore[arg-type]
 
     def _collect(self) -> None:
         self.buffer.extend(self._transitions(next(self._batches)))

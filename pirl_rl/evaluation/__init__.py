@@ -57,6 +57,8 @@ METRICS: dict[str, str] = {
     "success_low": "lower end of its 95% Wilson interval",
     "success_high": "upper end of its 95% Wilson interval",
     "reward": "mean payoff l_eps of the same episodes; equals success_rate for the hard payoff",
+    "value_spread": "standard deviation of V, raw but clamped to [0, 1], over the starts of the same episodes: 0 where "
+    "V is a constant",
     "optimal_reward": "reward of the optimal control from the same starts and seed, where it is known",
     "hjb_loss": "mean (L^pi V)^2, 1/s^2, at 4,096 held-out Sobol points outside A and B (drift: at the "
     "reference states from which the target can be reached), raw V",

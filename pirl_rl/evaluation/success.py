@@ -45,7 +45,8 @@ class Success:
         self.simulator = partial(Simulator, dt=dt, substeps=substeps, crossing=crossing)
 
     def __call__(self, solution: Solution) -> dict[str, float]:
-        """success_rate with its 95% interval (success_low, success_high), reward, and if known optimal_reward."""
+        """success_rate with its 95% interval (success_low, success_high), reward, value_spread, and if known
+        optimal_reward."""
         problem, generator = solution.problem, points_generator(self.seed)
         dt = self.simulator(problem).dt
         max_steps = round(problem.horizon / dt)
@@ -57,7 +58,14 @@ class Success:
             hard.payoff = Indicator()
             rate = self._mean(hard, solution.policy, tau, x)
         low, high = wilson_interval(rate * self.episodes, self.episodes)
-        metrics = {"success_rate": rate, "success_low": low, "success_high": high, "reward": reward}
+        spread = solution.raw_value(tau, x).clamp(0, 1).std(correction=0).item()
+        metrics = {
+            "success_rate": rate,
+            "success_low": low,
+            "success_high": high,
+            "reward": reward,
+            "value_spread": spread,
+        }
         if problem.optimal_control(tau[:1], x[:1]) is not None:
             metrics["optimal_reward"] = self._mean(problem, problem.optimal_control, tau, x)  # type: ignore[arg-type]
         return metrics
