@@ -79,12 +79,17 @@ def find_runs(folders: Sequence[str | Path]) -> dict[str, list[Run]]:
             )
         paths |= {path.resolve(): None for path in found}
     for path in paths:
-        run = _read_run(path)
+        run = read_run(path)
         groups.setdefault(run.label, []).append(run)
     return groups
 
 
-def _read_run(path: Path) -> Run:
+def read_run(path: Path) -> Run:
+    """Open one run directory.
+
+    Raises:
+        RunError: with the file and the reason.
+    """
     try:
         config = OmegaConf.load(path / ".hydra" / "config.yaml")
         names = [OmegaConf.select(config, key, throw_on_missing=True) for key in ("experiment_name", "method_name")]
@@ -107,7 +112,7 @@ def table(groups: dict[str, list[Run]]) -> str:
         cells = []
         for _, name, statistic in columns:
             values = _finite([run.get(name) for run in runs])
-            cells.append(_number(name, float(statistic(values))) if len(values) else "-")
+            cells.append(number(name, float(statistic(values))) if len(values) else "-")
         lines.append([label, str(len(runs)), *cells])
     return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
 
@@ -184,7 +189,8 @@ def _finite(values: Sequence[float]) -> np.ndarray:
     return array[np.isfinite(array)]
 
 
-def _number(name: str, value: float) -> str:
+def number(name: str, value: float) -> str:
+    """A metric as text, with the digits that matter."""
     if name in ("updates", "wall_seconds"):
         return f"{value:.0f}"
     return f"{value:.4f}" if name.startswith(("reward", "fine_success")) else f"{value:.2e}"
