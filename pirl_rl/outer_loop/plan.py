@@ -1,7 +1,7 @@
 """What an advisor is asked and what it answers, with the paper's field names (its appendix on scheduling by an agent).
 
-An answer is text from outside. It becomes a `Plan` only through `parse_plan`; nothing else of it is ever used. Its names
-are directory names, its checkpoints are looked up among those on offer and never read as paths.
+An answer is text from outside. It becomes a `Plan` only through `parse_plan`; nothing else of it is ever used. Its
+names are directory names, its checkpoints are looked up among those on offer and never read as paths.
 """
 
 from __future__ import annotations
@@ -129,8 +129,10 @@ class History(_Record):
         return min(sound, key=lambda result: result.metrics["calibration_mae"])
 
     def keeps(self, result: Result) -> bool:
-        """Whether a result is sound: done, and no worse than the baseline in reward by more than noise."""
-        return result.status == "done" and result.metrics["reward"] >= self.baseline.metrics["reward"] - self.tolerance
+        """Whether a result is sound: done, measured, and no worse than the baseline in reward by more than noise."""
+        measured = result.checkpoint is not None and {"reward", "calibration_mae"} <= result.metrics.keys()
+        least = self.baseline.metrics["reward"] - self.tolerance
+        return result.status == "done" and measured and result.metrics["reward"] >= least
 
     @property
     def checkpoints(self) -> dict[str, Result]:
@@ -154,10 +156,10 @@ def parse_plan(answer: str, history: History, count: int) -> Plan:
     fenced = re.fullmatch(r"\s*```(?:json)?\s*\n(.*)\n```\s*", answer, re.DOTALL)
     try:
         plan = Plan.model_validate(json.loads(fenced[1] if fenced else answer))
-    except (json.JSONDecodeError, RecursionError) as error:
-        raise PlanError([f"answer: expected one JSON object, got no JSON: {error}"]) from None
     except ValidationError as error:
         raise PlanError([_told(detail) for detail in error.errors()[:20]]) from None
+    except (ValueError, RecursionError) as error:  # also an integer of too many digits
+        raise PlanError([f"answer: expected one JSON object, got no JSON: {error}"]) from None
     errors = [*_count_errors(plan, count), *_start_errors(plan, history), *_repeat_errors(plan, history)]
     if errors:
         raise PlanError(errors)

@@ -24,7 +24,7 @@ class Request:
         updates: length of each.
         history: baseline and finished rounds.
         prompt: the same in words, for advisors that read.
-        folder: the round's own, where an advisor may leave files.
+        folder: for files of this asking; removed after the answer.
         errors: what was wrong with the answer before, on the second time of asking.
     """
 

@@ -1,0 +1,117 @@
+"""The built-in advisor: it raises the physics' weights while success and reward hold, and backs off when they fall."""
+
+from __future__ import annotations
+
+from pirl_rl.outer_loop.advisors import Request
+from pirl_rl.outer_loop.advisors.continuation import rounded, sigmoid, starts
+from pirl_rl.outer_loop.plan import Candidate, History, Plan, Result
+
+FIRST = 1e-3
+"""Where a weight begins that was zero: the order of the paper's first."""
+
+NOUGHT = 1e-9
+"""Weights up to this count as zero."""
+
+FIRST_JITTER = 0.005
+MOST_WEIGHT = 1e3
+
+POWERS = (1, 1 / 2, 1 / 4, 1 / 8, 0, *range(-1, -65, -1))
+"""Growth to these powers, in the order in which they are tried: each step back halves the step up; then the weights are
+held, then lowered.
+"""
+
+
+class Greedy:
+    """Deterministic, and right for any history: what steps in for advisors that fail.
+
+    HJB and boundary weights are multiplied by powers of `growth`; a round's candidates take powers in turn, and no
+    weights that are at least those of a candidate that fell. The TD weight and the share of replayed points stay.
+    Jitter rises with the weights, is held as soon as reward weakens and goes back with each further fall.
+
+    Args:
+        growth: largest factor of a round; > 1.
+        jitter_growth: factor of a round for the jitter; > 1.
+        most_jitter: up to which it rises, in units of half the box's widths; at most 1.
+    """
+
+    def __init__(self, growth: float = 2.0, jitter_growth: float = 1.25, most_jitter: float = 0.1):
+        if not 1 < growth <= 10 or not 1 < jitter_growth <= 10:
+            raise ValueError(f"growth and jitter_growth: expected 1 < factor <= 10, got {growth} and {jitter_growth}")
+        if not 0 <= most_jitter <= 1:
+            raise ValueError(f"most_jitter: expected a number from 0 to 1, got {most_jitter}")
+        self.growth, self.jitter_growth, self.most_jitter = growth, jitter_growth, most_jitter
+
+    def propose(self, request: Request) -> str:
+        used = {result.candidate.settings for result in request.history.results if result.candidate is not None}
+        chosen: list[Candidate] = []
+        for number, start in enumerate(starts(request.history, request.candidates), 1):
+            chosen.append(self._next(start, request, number, used))
+            used.add(chosen[-1].settings)
+        plan = Plan(round_note="; ".join(map(_told, chosen))[:4_000], candidates=chosen)
+        return plan.model_dump_json(indent=1, exclude_none=True)
+
+    def _next(self, start: Result, request: Request, number: int, used: set[tuple]) -> Candidate:
+        """The first continuation that is new and milder than all that fell from this start, or the mildest new one."""
+        fell = _fallen(start, request.history)
+        jitter = self._jitter(start, request.history, len(fell))
+        options = (self._candidate(start, power, jitter, number, request.updates) for power in POWERS)
+        fresh = (option for option in options if option.settings not in used)
+        option = None
+        for option in fresh:
+            if not any(_as_harsh(option, other) for other in fell):
+                break
+        return option or self._candidate(start, POWERS[-1], jitter, number, request.updates)
+
+    def _candidate(self, start: Result, power: float, jitter: float | None, number: int, updates: int) -> Candidate:
+        td, *physics = start.weights
+        final = [self._weight(now, power) for now in physics]
+        verb = "raise" if sum(final) > sum(physics) else "lower" if sum(final) < sum(physics) else "hold"
+        return Candidate(
+            name=f"{verb}-{number}",
+            start_checkpoint=str(start.checkpoint),
+            schedule_initial=start.weights,
+            schedule_final=(td, final[0], final[1]),
+            collocation_jitter=jitter,
+            **sigmoid(updates, share=0.5, slope=20.0),
+        )
+
+    def _weight(self, now: float, power: float) -> float:
+        if power == 0:
+            return now
+        base = now if now > NOUGHT else FIRST / self.growth
+        return min(rounded(base * self.growth**power), MOST_WEIGHT)
+
+    def _jitter(self, start: Result, history: History, falls: int) -> float | None:
+        """Its new value at the schedule's end, or None, which keeps it."""
+        now = start.collocation_jitter
+        if now is None:
+            return None
+        if falls > 1:
+            return min(rounded(now / self.jitter_growth ** (falls - 1)), 1.0)
+        weak = start.metrics["reward"] < history.baseline.metrics["reward"]
+        raised = rounded(max(now * self.jitter_growth, FIRST_JITTER))
+        return None if falls or weak or raised > self.most_jitter else raised
+
+
+def _fallen(start: Result, history: History) -> list[Candidate]:
+    """Continuations of a checkpoint that lost reward, collapsed or failed."""
+    return [
+        result.candidate
+        for result in history.results
+        if result.candidate is not None
+        and result.candidate.start_checkpoint == start.checkpoint
+        and not history.keeps(result)
+    ]
+
+
+def _as_harsh(option: Candidate, other: Candidate) -> bool:
+    return all(a >= b for a, b in zip(option.schedule_final[1:], other.schedule_final[1:], strict=True))
+
+
+def _told(candidate: Candidate) -> str:
+    (_, *before), (_, *after) = candidate.schedule_initial, candidate.schedule_final
+    jitter = "" if candidate.collocation_jitter is None else f", jitter to {candidate.collocation_jitter:g}"
+    return (
+        f"{candidate.name} from {candidate.start_checkpoint}: HJB weight {before[0]:g} to {after[0]:g}, "
+        f"boundary weight {before[1]:g} to {after[1]:g}{jitter}"
+    )

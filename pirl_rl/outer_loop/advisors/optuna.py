@@ -1,0 +1,133 @@
+"""Optuna plans: Bayesian or random search over the weights, the schedule's shape and the collocation's spread."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+from pirl_rl.outer_loop.advisors import Request
+from pirl_rl.outer_loop.advisors.continuation import rounded, sigmoid, starts
+from pirl_rl.outer_loop.plan import Candidate, History, Plan, Result
+
+try:
+    import optuna
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError("advisor=optuna needs Optuna: pip install 'pirl_rl[tune]'", name="optuna") from error
+
+from optuna.distributions import BaseDistribution, FloatDistribution
+from optuna.samplers import BaseSampler, RandomSampler, TPESampler
+from optuna.trial import FrozenTrial, create_trial
+
+
+class Optuna:
+    """Minimises calibration_mae; the study is rebuilt from the history each round, so that nothing is kept elsewhere.
+
+    A candidate starts from the best checkpoint, with its weights, and keeps its TD weight. Searched are the logarithms
+    of the final HJB and boundary weights, the schedule's center and sharpness in units of the candidate's length and,
+    where the collocation has them, jitter and share of replayed points. Candidates that collapsed, failed or lost
+    reward count as twice the worst error seen.
+
+    Args:
+        sampler: "tpe", a tree-structured Parzen estimator, or "random".
+        seed: of the sampler, with the round's number added; >= 0.
+        startup: finished candidates before TPE takes over from random draws.
+        weights: least and largest final weight, 0 < least < largest <= 1000.
+        jitter: largest jitter, 0 < jitter <= 1.
+    """
+
+    def __init__(
+        self,
+        sampler: Literal["tpe", "random"] = "tpe",
+        seed: int = 0,
+        startup: int = 4,
+        weights: Sequence[float] = (1e-4, 10.0),
+        jitter: float = 0.1,
+    ):
+        if sampler not in ("tpe", "random"):
+            raise ValueError(f"sampler: expected 'tpe' or 'random', got {sampler!r}")
+        if seed < 0 or startup < 1:
+            raise ValueError(f"expected seed >= 0 and startup >= 1, got {seed} and {startup}")
+        if len(weights) != 2 or not 0 < weights[0] < weights[1] <= 1e3:
+            raise ValueError(f"weights: expected [least, largest], 0 < least < largest <= 1000, got {list(weights)}")
+        if not 0 < jitter <= 1:
+            raise ValueError(f"jitter: expected 0 < jitter <= 1, got {jitter}")
+        self.sampler, self.seed, self.startup = sampler, seed, startup
+        low, high = (math.log10(weight) for weight in weights)
+        self.space = {
+            "hjb": FloatDistribution(low, high),
+            "boundary": FloatDistribution(low, high),
+            "center": FloatDistribution(0.3, 0.7),
+            # From a slope of 10 on, the sigmoid begins at the weights in force and ends at the final ones.
+            "slope": FloatDistribution(10.0, 100.0, log=True),
+            "jitter": FloatDistribution(0.0, jitter),
+            "replay_share": FloatDistribution(0.5, 1.0),
+        }
+
+    def propose(self, request: Request) -> str:
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        study = optuna.create_study(sampler=self._sampler(request.number))
+        study.add_trials(self._finished(request.history, request.updates))
+        chosen = []
+        for number, start in enumerate(starts(request.history, request.candidates), 1):
+            values = study.ask(self._space(start)).params
+            chosen.append(_candidate(values, start, f"trial-{number}", request.updates))
+        note = (
+            f"{self.sampler} sampler, seed {self.seed + request.number}, {len(study.trials) - len(chosen)} trials known"
+        )
+        return Plan(round_note=note, candidates=chosen).model_dump_json(indent=1, exclude_none=True)
+
+    def _sampler(self, number: int) -> BaseSampler:
+        seed = self.seed + number
+        return RandomSampler(seed) if self.sampler == "random" else TPESampler(seed=seed, n_startup_trials=self.startup)
+
+    def _space(self, start: Result) -> dict[str, BaseDistribution]:
+        absent = {
+            "jitter": start.collocation_jitter is None,
+            "replay_share": start.collocation_replay_share is None,
+        }
+        return {name: values for name, values in self.space.items() if not absent.get(name, False)}
+
+    def _finished(self, history: History, updates: int) -> list[FrozenTrial]:
+        """Those candidates that lie in the space, whoever planned them."""
+        sound = [history.baseline, *(result for result in history.results if history.keeps(result))]
+        penalty = 2 * max(result.metrics["calibration_mae"] for result in sound)
+        trials = []
+        for result in history.results:
+            values = {} if result.candidate is None else _values(result.candidate, result, updates)
+            within = all(self.space[name].low <= value <= self.space[name].high for name, value in values.items())
+            if values and within:
+                value = result.metrics["calibration_mae"] if history.keeps(result) else penalty
+                distributions: dict[str, BaseDistribution] = {name: self.space[name] for name in values}
+                trials.append(create_trial(params=values, distributions=distributions, value=value))
+        return trials
+
+
+def _candidate(values: Mapping[str, float], start: Result, name: str, updates: int) -> Candidate:
+    return Candidate(
+        name=name,
+        start_checkpoint=str(start.checkpoint),
+        schedule_initial=start.weights,
+        schedule_final=(start.weights[0], rounded(10 ** values["hjb"]), rounded(10 ** values["boundary"])),
+        **sigmoid(updates, values["center"], values["slope"]),
+        collocation_jitter=rounded(values["jitter"]) if "jitter" in values else None,
+        collocation_replay_share=rounded(values["replay_share"]) if "replay_share" in values else None,
+    )
+
+
+def _values(candidate: Candidate, result: Result, updates: int) -> dict[str, float]:
+    """A finished candidate's point of the space; what it left to its start is read from its end."""
+    _, hjb, boundary = candidate.schedule_final
+    values = {
+        "hjb": math.log10(hjb) if hjb > 0 else -math.inf,
+        "boundary": math.log10(boundary) if boundary > 0 else -math.inf,
+        "center": candidate.schedule_center / updates,
+        "slope": candidate.schedule_sharpness * updates,
+        "jitter": candidate.collocation_jitter,
+        "replay_share": candidate.collocation_replay_share,
+    }
+    if candidate.collocation_jitter is None:
+        values["jitter"] = result.collocation_jitter
+    if candidate.collocation_replay_share is None:
+        values["replay_share"] = result.collocation_replay_share
+    return {name: value for name, value in values.items() if value is not None}
