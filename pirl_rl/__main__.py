@@ -14,6 +14,7 @@ COMMANDS = (
     ("python -m pirl_rl.train resume=RUN_DIR", "go on with a run"),
     ("python -m pirl_rl.train +experiment=reach1d --cfg job", "show all settings"),
     ("python -m pirl_rl.evaluate run=RUN_DIR", "evaluate a run again, with other samples or simulators if asked"),
+    ("python -m pirl_rl.tune +experiment=drift start=RUN_DIR", "go on from a run in rounds that an advisor plans"),
     ("python -m pirl_rl.compare RUN_DIRS", "one table and one figure of many runs"),
 )
 GROUPS = {
@@ -21,6 +22,7 @@ GROUPS = {
     "method": "methods, method=NAME",
     "collector": "collectors, collector=NAME",
     "logger": "loggers, logger=NAME",
+    "advisor": "advisors of the outer loop, advisor=NAME",
 }
 
 

@@ -1,0 +1,73 @@
+"""The start of a loop: the checkpoint that all continue from, measured as every candidate will be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from pirl_rl import checkpoint
+from pirl_rl.assembly import make_trainer
+from pirl_rl.collocation import ReplayCollocation
+from pirl_rl.configuration import ConfigError, load_config
+from pirl_rl.evaluation import evaluate
+from pirl_rl.outer_loop.candidates import JUDGED
+from pirl_rl.outer_loop.plan import START, Result
+from pirl_rl.trainer import Trainer
+
+
+def measure(trainer: Trainer, path: Path, trust: Sequence[str] = ()) -> Result:
+    """The baseline.
+
+    Args:
+        trainer: of a candidate, begun from the start.
+        path: the start's checkpoint, in its run directory.
+        trust: modules outside the package that its configuration may name.
+
+    Raises:
+        ConfigError: the run's configuration cannot be built, or it has no finite reward and calibration.
+    """
+    metrics = {name: value for name, value in evaluate(trainer.solution, trainer.final).items() if math.isfinite(value)}
+    if missing := [name for name in JUDGED if name not in metrics]:
+        raise ConfigError(f"start: expected finite {', '.join(missing)} of {path}, and there is none to compare with")
+    try:
+        return Result(checkpoint=START, metrics=metrics, **_in_force(path, trainer, trust))
+    except ValidationError as error:
+        raise ConfigError(f"start: {path} ended with settings that no plan has: {error.errors()[0]['msg']}") from None
+
+
+def tolerance(baseline: Result) -> float:
+    """The 95% half-width of the difference of two success rates such as the baseline's."""
+    low, high = (baseline.metrics[name] for name in ("success_low", "success_high"))
+    return math.sqrt(2) * (high - low) / 2
+
+
+def _in_force(path: Path, trainer: Trainer, trust: Sequence[str]) -> dict[str, Any]:
+    """Weights and settings of the collocation at the start's last update, by its own run's configuration.
+
+    Where the candidates' collocation has no such settings there are none; where only the start's had none, they begin
+    with the candidates' own.
+    """
+    config = load_config(path.parent.parent)
+    config.device, before = "cpu", make_trainer(config, None, trust)
+    last = max(_update(checkpoint.load(path)) - 1, 0)
+    settings: dict[str, Any] = {"weights": before.learner.schedule(last)}
+    if isinstance(trainer.collocation, ReplayCollocation):
+        stage = None if before.stages is None else before.stages.stages[before.stages.index(last)].collocation
+        own = stage or before.collocation
+        ends, progress = trainer.collocation, 0.0
+        if isinstance(own, ReplayCollocation):
+            ends, progress = own, before.learner.schedule.progress(last)
+        for name in ("jitter", "replay_share"):
+            first, final = getattr(ends, name)
+            settings[f"collocation_{name}"] = first + (final - first) * progress
+    return settings
+
+
+def _update(state: Mapping[str, Any]) -> int:
+    """Which update's networks a checkpoint holds; after a collapse those of an earlier one are back."""
+    rollback = state.get("rollback") or {}
+    return rollback["good_at"] if rollback.get("collapsed_at") is not None else state["update"]
