@@ -35,6 +35,8 @@ def export(run: Path, out: Path) -> Path:
     refuse_links(run)
     if out.exists():
         raise ConfigError(f"out: {out} exists, and an export never overwrites anything")
+    if "start" in config:
+        config.start = None  # a path of this machine
     save_config(config, out)
     loss = {name: entry for name, entry in checkpoint.loss_state(state).items() if not name.startswith(TARGET)}
     path = checkpoint.weights_path(out / checkpoint.FOLDER, state["update"])

@@ -18,6 +18,7 @@ import hydra
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from pirl_rl.assembly import begin, make_trainer
@@ -192,8 +193,20 @@ def _resumable(out: Path) -> Iterator[None]:
         signal.signal(signal.SIGTERM, previous)
 
 
+def _readable(argument: str) -> str:
+    """The line of `advisor.command`, whose quotes a shell has taken away, as Hydra reads it: in quotes."""
+    key, _, line = argument.partition("=")
+    if key.lstrip("+") != "advisor.command":
+        return argument
+    try:
+        OverridesParser.create().parse_override(argument)
+    except HydraException:
+        return f"{key}={quoted(line)}"
+    return argument
+
+
 def main() -> None:
-    arguments = sys.argv[1:]
+    sys.argv[1:] = arguments = [_readable(text) for text in sys.argv[1:]]
     # Libraries about each other: nothing a user could mend.
     warnings.filterwarnings("ignore", category=FutureWarning, module=r"(torch|tensordict|torchrl)\b")
     if "--report" in arguments:

@@ -7,7 +7,7 @@ import torch
 from small import small_trainer
 
 from pirl_rl import load_run
-from pirl_rl.configuration import ConfigError
+from pirl_rl.configuration import ConfigError, load_config, save_config
 from pirl_rl.export import export, main
 
 
@@ -31,6 +31,17 @@ def test_an_export_opens_like_its_run_and_is_small(run, tmp_path):
     weights = "checkpoints/weights-000000010.pt"
     assert names == {".hydra/config.yaml", "summary.json", "metrics.csv", "figures/value.png", weights}
     assert (tmp_path / "model" / weights).stat().st_size < (run / "checkpoints" / "last.pt").stat().st_size / 2
+
+
+def test_where_the_run_started_from_is_not_told(run, tmp_path):
+    config = load_config(run)
+    config.start = str(tmp_path / "before")
+    save_config(config, run)
+    export(run, tmp_path / "model")
+    exported = load_config(tmp_path / "model")
+    assert exported.start is None
+    assert {**exported, "start": config.start} == dict(config)
+    assert str(tmp_path) not in (tmp_path / "model" / ".hydra" / "config.yaml").read_text()
 
 
 def test_nothing_is_overwritten(run, tmp_path):

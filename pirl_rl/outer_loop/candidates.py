@@ -185,9 +185,10 @@ def _result(task: Task, updates: int, checkpoint: str | None = None, **rest) -> 
     )
 
 
-def quoted(path: Path) -> str:
-    """A path as a value of Hydra's command line, whatever characters it has."""
-    return "'" + str(path).replace("'", "\\'") + "'"
+def quoted(text: Path | str) -> str:
+    """A path or text as a value of Hydra's command line, whatever characters it has."""
+    backslashes = re.sub(r"(\\+)(?='|\Z)", r"\1\1", str(text))  # elsewhere they stand for themselves
+    return "'" + backslashes.replace("'", "\\'") + "'"
 
 
 def _list(values: Sequence[float]) -> str:
