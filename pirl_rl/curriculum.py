@@ -25,6 +25,7 @@ class Stage:
         n_steps: length of returns.
         actor_every: critic updates for each update of the actor and the targets.
         model_steps: control steps that the actor's rule "model" looks ahead.
+        learning_rate: a course of its own for it: from this rate, decaying over the stage as the run's does over the run.
         train_actor: False freezes the actor, so that the critics come to rest at the value of one policy.
     """
 
@@ -35,6 +36,7 @@ class Stage:
     n_steps: int | None = None
     actor_every: int | None = None
     model_steps: int | None = None
+    learning_rate: float | None = None
     train_actor: bool = True
 
     def __post_init__(self):
@@ -44,6 +46,8 @@ class Stage:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"stage.{name}: expected at least 1, got {value}")
+        if self.learning_rate is not None and not self.learning_rate > 0:
+            raise ValueError(f"stage.learning_rate: expected a number > 0, got {self.learning_rate}")
 
 
 class Curriculum:
@@ -58,7 +62,7 @@ class Curriculum:
     def __init__(self, schedule: Schedule, updates: int, stages: Sequence[Stage] = (Stage(1.0),)):
         if not stages:
             raise ValueError("curriculum.stages: expected at least one stage, got none")
-        self.schedule, self.stages = schedule, tuple(stages)
+        self.schedule, self.stages, self._updates = schedule, tuple(stages), updates
         self._before = [0.0, *accumulate(stage.updates for stage in stages)]
         self._stretch = updates / self._before.pop()
         # Rounding of the stretch is not to shift a stage by one update.
@@ -71,6 +75,14 @@ class Curriculum:
     def begins(self, update: int) -> bool:
         """Whether a stage begins with this update."""
         return update in self._starts
+
+    def course(self, update: int) -> float:
+        """How far the learning rate's course is: a fraction of the run, or of a stage with a rate of its own."""
+        index = self.index(update)
+        if self.stages[index].learning_rate is None:
+            return update / self._updates
+        begin, end = [*self._starts, self._updates][index : index + 2]
+        return (update - begin) / (end - begin)
 
     def __call__(self, update: int) -> Weights:
         schedule, own = self._schedule(update)

@@ -71,7 +71,7 @@ class Learner:
         "loss_actor" is that of the actor's last update.
 
         Args:
-            progress: k as a fraction of the run, for the learning rate.
+            progress: how far the learning rate's course is, from 0 to 1.
 
         Raises:
             DivergenceError: before the step that would have spoilt the networks.

@@ -89,8 +89,8 @@ class Trainer:
                 raise ValueError(f"trainer.{name}: expected an integer >= {least}, got {value!r}")
         self.learner, self.collector, self.collocation, self.boundary = learner, collector, collocation, boundary
         self.stages = stages
-        actor = learner.actor_every, learner.loss.model_steps
-        self._unstaged = collector.initial_states, collector.n_steps, collocation, *actor
+        rates = learner.actor_every, learner.loss.model_steps, learner.learning_rate
+        self._unstaged = collector.initial_states, collector.n_steps, collocation, *rates
         self.updates, self.batch_size = updates, batch_size
         self.log_every, self.evaluate_every, self.checkpoint_every = log_every, evaluate_every, checkpoint_every
         self.during, self.final = tuple(during), tuple(final)
@@ -165,7 +165,7 @@ class Trainer:
                 if self.stages is not None and self.stages.begins(k):
                     self._begin_stage()
                 self.collector.step(k)
-                terms = self.learner.update(self.sample(), k, k / self.updates)
+                terms = self.learner.update(self.sample(), k, self._course(k))
                 self.update, self.wall_seconds = k + 1, time.perf_counter() - begin
                 row = self._row(k, terms)
                 if row:
@@ -180,16 +180,20 @@ class Trainer:
                 if stop:
                     raise Interrupted(self.update)
 
+    def _course(self, k: int) -> float:
+        return k / self.updates if self.stages is None else self.stages.course(k)
+
     def _begin_stage(self) -> None:
         """Take over what the stage of the next update sets, and the run's own for the rest."""
         if self.stages is None:
             return
         stage = self.stages.stages[self.stages.index(self.update)]
-        initial_states, n_steps, collocation, actor_every, model_steps = self._unstaged
+        initial_states, n_steps, collocation, actor_every, model_steps, learning_rate = self._unstaged
         self.collector.play(stage.initial_states or initial_states, stage.n_steps or n_steps)
         self.collocation = stage.collocation or collocation
         self.learner.actor_every, self.learner.train_actor = stage.actor_every or actor_every, stage.train_actor
         self.learner.loss.model_steps = stage.model_steps or model_steps
+        self.learner.learning_rate = stage.learning_rate or learning_rate
 
     def sample(self) -> TensorDict:
         """The batch of one update; a term of negligible weight is left out of the work."""
@@ -210,7 +214,7 @@ class Trainer:
         if not (k == 0 or evaluates or self.update % self.log_every == 0):
             return {}
         stage = {} if self.stages is None else {"stage": self.stages.index(k)}
-        row = {"update": self.update, **stage, **self.learner.weights_and_rate(k, k / self.updates)}
+        row = {"update": self.update, **stage, **self.learner.weights_and_rate(k, self._course(k))}
         for name in ("td_loss", "hjb_loss", "boundary_loss", "loss_actor"):
             value = terms[name].item() if name in terms else math.nan
             row[name if name.startswith("loss") else f"train_{name}"] = value

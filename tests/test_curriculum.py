@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from small import assert_same, at_update, interrupt, resumed, small_trainer
 
 from pirl_rl import checkpoint
 from pirl_rl.curriculum import Curriculum, Stage
+from pirl_rl.plots import read_metrics
 from pirl_rl.schedules import ConstantSchedule, LinearSchedule, LossSchedule
 from pirl_rl.trainer import Interrupted
 
@@ -44,6 +47,7 @@ def test_each_stage_begins_once():
     [
         (lambda: Stage(0), "stage.updates: expected a number > 0, got 0"),
         (lambda: Stage(1, actor_every=0), "stage.actor_every"),
+        (lambda: Stage(1, learning_rate=0.0), "stage.learning_rate: expected a number > 0"),
         (lambda: Curriculum(WHOLE, 10, []), "at least one stage"),
     ],
 )
@@ -98,3 +102,17 @@ def test_a_frozen_actor_stays_while_critics_and_targets_move(tmp_path):
         if name.endswith("weight") and "network" in name:
             frozen = name.startswith("actor")
             assert torch.equal(entry, half[name]) == frozen, name
+
+
+def test_a_stage_with_a_rate_of_its_own_has_the_whole_decay_in_it(tmp_path):
+    """From its rate down a quarter wave; the stages beside it stay on the run's course."""
+    stages = "stages=[{updates: 1}, {updates: 2, learning_rate: 0.01}, {updates: 1}]"
+    trainer = small_trainer(tmp_path, stages, "trainer.updates=40", "trainer.log_every=1", "learner.learning_rate=1e-3")
+    trainer.train()
+    rate = read_metrics(tmp_path / "metrics.csv")["learning_rate"]
+
+    def wave(peak, progress):
+        return pytest.approx(peak * (1 + math.cos(math.pi * progress)) / 2)
+
+    assert [rate[k] for k in (0, 9, 30)] == [wave(1e-3, k / 40) for k in (0, 9, 30)]
+    assert [rate[k] for k in (10, 20, 29)] == [wave(0.01, (k - 10) / 20) for k in (10, 20, 29)]
