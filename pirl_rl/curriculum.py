@@ -25,7 +25,7 @@ class Stage:
         n_steps: length of returns.
         actor_every: critic updates for each update of the actor and the targets.
         model_steps: control steps that the actor's rule "model" looks ahead.
-        learning_rate: a course of its own for it: from this rate, decaying over the stage as the run's does over the run.
+        learning_rate: a rate of its own, which decays over the stage as the run's does over the run.
         train_actor: False freezes the actor, so that the critics come to rest at the value of one policy.
     """
 

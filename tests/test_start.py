@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-
 import pytest
 import torch
 from small import QUICK, assert_same, at_update, interrupt, resumed, small_trainer
@@ -172,21 +170,8 @@ def test_transitions_of_another_environment_are_refused(first, tmp_path):
 
 
 @pytest.fixture
-def cli(tmp_path, monkeypatch, capfd):
-    """Runs the command in this process, from an empty directory: (exit code, what it printed)."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: str) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["train", *arguments])
-        code = 0
-        try:
-            train.main()
-        except SystemExit as stop:
-            code = stop.code
-        printed = capfd.readouterr()
-        return code, printed.out + printed.err
-
-    return call
+def cli(in_process):
+    return in_process(train)
 
 
 def test_the_command_starts_from_a_run(first, cli, tmp_path):

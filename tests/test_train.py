@@ -41,21 +41,8 @@ def names(group: str) -> list[str]:
 
 
 @pytest.fixture
-def cli(tmp_path, monkeypatch, capfd):
-    """Runs the command in this process, from an empty directory: (exit code, what it printed)."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: str) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["train", *arguments])
-        code = 0
-        try:
-            train.main()
-        except SystemExit as stop:
-            code = stop.code
-        printed = capfd.readouterr()
-        return code, printed.out + printed.err
-
-    return call
+def cli(in_process):
+    return in_process(train)
 
 
 def only_run(folder: Path) -> Path:

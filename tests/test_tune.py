@@ -36,22 +36,10 @@ def trained(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def cli(tmp_path, monkeypatch, capfd):
-    """Runs the command in this process with a fake training: (exit code, what it printed)."""
-    monkeypatch.chdir(tmp_path)
+def cli(in_process, monkeypatch):
+    """The command with a fake training."""
     monkeypatch.setattr(tune, "Processes", lambda parallel, inherited: FakeTrain())
-
-    def call(*arguments: str) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["tune", *arguments])
-        code = 0
-        try:
-            tune.main()
-        except SystemExit as stop:
-            code = stop.code
-        printed = capfd.readouterr()
-        return code, printed.out + printed.err
-
-    return call
+    return in_process(tune)
 
 
 def test_command_line(cli, trained, tmp_path):

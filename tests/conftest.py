@@ -1,0 +1,30 @@
+"""What tests of the commands share."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+
+@pytest.fixture
+def in_process(tmp_path, monkeypatch, capfd):
+    """`in_process(train)` runs that module's `main` here, from an empty directory, with the arguments that it is
+    called with: (exit code, what it printed).
+    """
+    monkeypatch.chdir(tmp_path)
+
+    def of(module):
+        def call(*arguments: str) -> tuple[int, str]:
+            monkeypatch.setattr(sys, "argv", [module.__name__, *arguments])
+            code = 0
+            try:
+                module.main()
+            except SystemExit as stop:
+                code = stop.code
+            printed = capfd.readouterr()
+            return code, printed.out + printed.err
+
+        return call
+
+    return of
