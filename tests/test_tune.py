@@ -191,7 +191,16 @@ def test_parallel_changes_nothing(trained, tmp_path):
     assert decided(tmp_path / "out1") == decided(tmp_path / "out2")
 
 
+@pytest.fixture
+def hearing():
+    """A shell lets what it starts in the background ignore SIGINT, which is passed on to all that is started here."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("hearing")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupt_saves_and_tells_how_to_go_on(number, trained, tmp_path):
     loop = start(tmp_path, *real("out", trained, "rounds=1", "candidates=1", "updates=1000000"))
