@@ -44,7 +44,8 @@ class Trainer:
         learner: the update.
         collector: fills the replay buffer.
         collocation, boundary: samplers of the physics.
-        stages: changes of starts, collocation and actor rate over the run; the schedule of `learner` has them already.
+        stages: changes of starts, collocation, returns and actor over the run; the schedule of `learner` has their
+            weights already; default a single stage.
         updates: critic updates of the whole run.
         batch_size: transitions an update.
         log_every: updates between rows of metrics.
@@ -88,7 +89,7 @@ class Trainer:
             if not (isinstance(value, int) and value >= least):
                 raise ValueError(f"trainer.{name}: expected an integer >= {least}, got {value!r}")
         self.learner, self.collector, self.collocation, self.boundary = learner, collector, collocation, boundary
-        self.stages = stages
+        self.stages = stages or Curriculum(learner.schedule, updates)
         rates = learner.actor_every, learner.loss.model_steps, learner.learning_rate
         self._unstaged = collector.initial_states, collector.n_steps, collocation, *rates
         self.updates, self.batch_size = updates, batch_size
@@ -162,10 +163,10 @@ class Trainer:
         begin = time.perf_counter() - self.wall_seconds
         with Progress(self.updates, self.update) as progress:
             for k in range(self.update, self.updates):
-                if self.stages is not None and self.stages.begins(k):
+                if self.stages.begins(k):
                     self._begin_stage()
                 self.collector.step(k)
-                terms = self.learner.update(self.sample(), k, self._course(k))
+                terms = self.learner.update(self.sample(), k, self.stages.course(k))
                 self.update, self.wall_seconds = k + 1, time.perf_counter() - begin
                 row = self._row(k, terms)
                 if row:
@@ -180,13 +181,8 @@ class Trainer:
                 if stop:
                     raise Interrupted(self.update)
 
-    def _course(self, k: int) -> float:
-        return k / self.updates if self.stages is None else self.stages.course(k)
-
     def _begin_stage(self) -> None:
         """Take over what the stage of the next update sets, and the run's own for the rest."""
-        if self.stages is None:
-            return
         stage = self.stages.stages[self.stages.index(self.update)]
         initial_states, n_steps, collocation, actor_every, model_steps, learning_rate = self._unstaged
         self.collector.play(stage.initial_states or initial_states, stage.n_steps or n_steps)
@@ -213,8 +209,8 @@ class Trainer:
         evaluates = bool(self.evaluate_every) and (k == 0 or self.update % self.evaluate_every == 0)
         if not (k == 0 or evaluates or self.update % self.log_every == 0):
             return {}
-        stage = {} if self.stages is None else {"stage": self.stages.index(k)}
-        row = {"update": self.update, **stage, **self.learner.weights_and_rate(k, self._course(k))}
+        stage = {"stage": self.stages.index(k)} if len(self.stages.stages) > 1 else {}
+        row = {"update": self.update, **stage, **self.learner.weights_and_rate(k, self.stages.course(k))}
         for name in ("td_loss", "hjb_loss", "boundary_loss", "loss_actor"):
             value = terms[name].item() if name in terms else math.nan
             row[name if name.startswith("loss") else f"train_{name}"] = value

@@ -56,8 +56,7 @@ def _in_force(path: Path, trainer: Trainer, trust: Sequence[str]) -> dict[str, A
     last = max(_update(checkpoint.load(path)) - 1, 0)
     settings: dict[str, Any] = {"weights": before.learner.schedule(last)}
     if isinstance(trainer.collocation, ReplayCollocation):
-        stage = None if before.stages is None else before.stages.stages[before.stages.index(last)].collocation
-        own = stage or before.collocation
+        own = before.stages.stages[before.stages.index(last)].collocation or before.collocation
         ends, progress = trainer.collocation, 0.0
         if isinstance(own, ReplayCollocation):
             ends, progress = own, before.learner.schedule.progress(last)
