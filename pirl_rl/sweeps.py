@@ -1,4 +1,4 @@
-"""What a Hydra multirun leaves behind: a tidy directory, and a table and a figure of a metric over the settings swept.
+"""A sweep: table and figure of a metric over the settings of a multirun.
 
 python -m pirl_rl.sweeps DIR [--metric value_mse] [--axes KEY [KEY]] [--out FOLDER]
 """
@@ -6,19 +6,16 @@ python -m pirl_rl.sweeps DIR [--metric value_mse] [--axes KEY [KEY]] [--out FOLD
 from __future__ import annotations
 
 import argparse
-import atexit
-import contextlib
 import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import yaml
-from hydra.experimental.callback import Callback
 from matplotlib.figure import Figure
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from pirl_rl.compare import RunError, number, read_run
@@ -29,22 +26,6 @@ OVERRIDES = Path(".hydra") / "overrides.yaml"
 AVERAGED = "seed"
 UNSET = "default"
 """Stands for the value of a setting in the runs in which it was not typed."""
-
-
-class TidySweep(Callback):
-    """A sweep of which no job began, as with a mistyped setting, leaves no directory."""
-
-    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        atexit.register(_remove_if_bare, Path(config.hydra.sweep.dir).absolute())
-
-
-def _remove_if_bare(folder: Path) -> None:
-    if folder.is_dir() and [path.name for path in folder.iterdir()] == ["multirun.yaml"]:
-        (folder / "multirun.yaml").unlink()
-        with contextlib.suppress(OSError):
-            folder.rmdir()
-            for parent in (folder.parent, folder.parent.parent):
-                parent.rmdir()  # empty ones only
 
 
 class Job(NamedTuple):
