@@ -1,10 +1,11 @@
-"""What the commands share: overrides of a run's settings, the table of metrics, and errors told in one line."""
+"""What the commands share: overrides of a run's settings, the table of metrics, errors told in one line, warnings."""
 
 from __future__ import annotations
 
 import contextlib
 import sys
 import textwrap
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -33,6 +34,11 @@ EXPECTED = (
 """Errors that are the user's to mend: their message is enough."""
 
 INTERRUPTED = 130
+
+
+def quiet_libraries() -> None:
+    """What libraries warn of about each other, while they compile, no user can mend."""
+    warnings.filterwarnings("ignore", category=FutureWarning, module=r"(torch|tensordict|torchrl)\b")
 
 
 def table(summary: Mapping[str, float]) -> str:

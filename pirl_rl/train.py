@@ -7,7 +7,6 @@ from __future__ import annotations
 import contextlib
 import shutil
 import sys
-import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from pirl_rl import checkpoint
 from pirl_rl.assembly import begin, make_trainer, restore
 from pirl_rl.configuration import CONF, ConfigError, load_config, save_config
-from pirl_rl.console import INTERRUPTED, named_modules, override, table, told
+from pirl_rl.console import INTERRUPTED, named_modules, override, quiet_libraries, table, told
 from pirl_rl.loggers import METRICS_FILE
 from pirl_rl.plots import FIGURES, draw_run
 from pirl_rl.runs import refuse_links
@@ -90,8 +89,7 @@ def _new(folder: Path) -> Iterator[None]:
 
 
 def main() -> None:
-    # Libraries about each other, while they compile: nothing a user could mend.
-    warnings.filterwarnings("ignore", category=FutureWarning, module=r"(torch|tensordict|torchrl)\b")
+    quiet_libraries()
     arguments = sys.argv[1:]
     resumed = [item for item in arguments if item.startswith("resume=") and item != "resume=null"]
     try:

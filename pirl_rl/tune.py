@@ -10,7 +10,6 @@ import contextlib
 import shlex
 import signal
 import sys
-import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from pirl_rl.assembly import begin, make_trainer
 from pirl_rl.configuration import CONF, ConfigError, build, convert
-from pirl_rl.console import INTERRUPTED, named_modules, told
+from pirl_rl.console import INTERRUPTED, named_modules, quiet_libraries, told
 from pirl_rl.files import replacing
 from pirl_rl.outer_loop.candidates import LEADING, Task, overrides, quoted
 from pirl_rl.outer_loop.directory import KEPT, check, locked
@@ -207,8 +206,7 @@ def _readable(argument: str) -> str:
 
 def main() -> None:
     sys.argv[1:] = arguments = [_readable(text) for text in sys.argv[1:]]
-    # Libraries about each other: nothing a user could mend.
-    warnings.filterwarnings("ignore", category=FutureWarning, module=r"(torch|tensordict|torchrl)\b")
+    quiet_libraries()
     if "--report" in arguments:
         named = [item.partition("=")[2] for item in arguments if item.startswith("out=")]
         named += [item for item in arguments if not item.startswith(("-", "out="))]
