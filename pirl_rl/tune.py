@@ -26,8 +26,9 @@ from pirl_rl.console import INTERRUPTED, named_modules, quiet_libraries, told
 from pirl_rl.files import replacing
 from pirl_rl.outer_loop.candidates import LEADING, Task, overrides, quoted
 from pirl_rl.outer_loop.directory import KEPT, check, locked
+from pirl_rl.outer_loop.history import Result
 from pirl_rl.outer_loop.loop import Loop, Settings
-from pirl_rl.outer_loop.plan import START, Candidate, Result
+from pirl_rl.outer_loop.plan import START, Candidate
 from pirl_rl.outer_loop.processes import Processes
 from pirl_rl.outer_loop.record import Record
 from pirl_rl.outer_loop.redaction import redact

@@ -13,8 +13,10 @@ import numpy as np
 
 from pirl_rl.outer_loop.advisors import Request
 from pirl_rl.outer_loop.advisors.greedy import Greedy
+from pirl_rl.outer_loop.history import History, Result, Round
 from pirl_rl.outer_loop.loop import Loop, Settings
-from pirl_rl.outer_loop.plan import Candidate, History, Plan, Result, Round, parse_plan
+from pirl_rl.outer_loop.parsing import parse_plan
+from pirl_rl.outer_loop.plan import Candidate, Plan
 from pirl_rl.outer_loop.processes import Job
 from pirl_rl.outer_loop.prompt import render
 from pirl_rl.outer_loop.record import Record

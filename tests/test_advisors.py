@@ -13,7 +13,8 @@ from pirl_rl.configuration import CONF, ConfigError, build
 from pirl_rl.outer_loop.advisors import AdvisorError
 from pirl_rl.outer_loop.advisors.file import File
 from pirl_rl.outer_loop.advisors.greedy import Greedy
-from pirl_rl.outer_loop.plan import MAX_ANSWER, Plan, PlanError, parse_plan
+from pirl_rl.outer_loop.parsing import MAX_ANSWER, PlanError, parse_plan
+from pirl_rl.outer_loop.plan import Plan
 
 
 def test_only_what_was_measured_and_can_be_started_from_is_sound():

@@ -15,7 +15,7 @@ from rounds import after, history, improves, request
 
 from pirl_rl.outer_loop.advisors import AdvisorError
 from pirl_rl.outer_loop.advisors.command import TAIL, Command
-from pirl_rl.outer_loop.plan import PlanError, parse_plan
+from pirl_rl.outer_loop.parsing import PlanError, parse_plan
 from pirl_rl.outer_loop.prompt import asked
 
 AGENT = """

@@ -10,7 +10,8 @@ import pytest
 from rounds import after, fate, history, improves, request
 
 from pirl_rl.outer_loop.advisors.greedy import POWERS, Greedy
-from pirl_rl.outer_loop.plan import Candidate, parse_plan
+from pirl_rl.outer_loop.parsing import parse_plan
+from pirl_rl.outer_loop.plan import Candidate
 
 
 def falls(candidate: Candidate) -> dict:

@@ -16,7 +16,7 @@ from rounds import history, plan, request
 
 from pirl_rl.outer_loop.advisors import AdvisorError, openai
 from pirl_rl.outer_loop.advisors.openai import OpenAI
-from pirl_rl.outer_loop.plan import parse_plan
+from pirl_rl.outer_loop.parsing import parse_plan
 
 KEY = "sk-0123456789abcdef"
 

@@ -11,7 +11,9 @@ from rounds import after, fate, history, request
 
 from pirl_rl.outer_loop.advisors.greedy import Greedy
 from pirl_rl.outer_loop.advisors.optuna import Optuna
-from pirl_rl.outer_loop.plan import Candidate, History, Result, parse_plan
+from pirl_rl.outer_loop.history import History, Result
+from pirl_rl.outer_loop.parsing import parse_plan
+from pirl_rl.outer_loop.plan import Candidate
 
 
 def valley(candidate: Candidate) -> dict:

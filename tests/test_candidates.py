@@ -17,7 +17,8 @@ from pirl_rl import checkpoint
 from pirl_rl.assembly import begin
 from pirl_rl.configuration import CONF, ConfigError
 from pirl_rl.outer_loop.candidates import Task, job, overrides, quoted, result, settle
-from pirl_rl.outer_loop.plan import Candidate, Result
+from pirl_rl.outer_loop.history import Result
+from pirl_rl.outer_loop.plan import Candidate
 from pirl_rl.outer_loop.start import measure
 from pirl_rl.schedules import LossSchedule
 

@@ -8,7 +8,8 @@ import pytest
 from rounds import after, history, improves, plan, request
 
 from pirl_rl.outer_loop.advisors.greedy import Greedy
-from pirl_rl.outer_loop.plan import History, Plan
+from pirl_rl.outer_loop.history import History
+from pirl_rl.outer_loop.plan import Plan
 from pirl_rl.outer_loop.prompt import render
 
 

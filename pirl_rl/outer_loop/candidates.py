@@ -17,7 +17,8 @@ from pirl_rl import checkpoint
 from pirl_rl.configuration import ConfigError
 from pirl_rl.console import INTERRUPTED
 from pirl_rl.files import replacing
-from pirl_rl.outer_loop.plan import Candidate, Result
+from pirl_rl.outer_loop.history import Result
+from pirl_rl.outer_loop.plan import Candidate
 from pirl_rl.outer_loop.processes import Job
 from pirl_rl.outer_loop.redaction import redact
 from pirl_rl.runs import refuse_links

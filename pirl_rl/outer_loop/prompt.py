@@ -11,7 +11,8 @@ from jinja2.sandbox import SandboxedEnvironment
 
 from pirl_rl.configuration import CONF
 from pirl_rl.outer_loop.advisors import Request
-from pirl_rl.outer_loop.plan import START, History, Plan
+from pirl_rl.outer_loop.history import History
+from pirl_rl.outer_loop.plan import START, Plan
 
 TEMPLATE = CONF / "prompt.md.j2"
 

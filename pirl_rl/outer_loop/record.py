@@ -15,7 +15,8 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from pirl_rl.configuration import ConfigError
 from pirl_rl.files import replacing
-from pirl_rl.outer_loop.plan import History, Plan, Result, Round
+from pirl_rl.outer_loop.history import History, Result, Round
+from pirl_rl.outer_loop.plan import Plan
 from pirl_rl.outer_loop.redaction import redact
 
 CONTEXT = "<!-- What the advisor should know: read again before every round. Comments like this one are left out. -->\n"

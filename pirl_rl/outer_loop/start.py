@@ -15,7 +15,8 @@ from pirl_rl.collocation import ReplayCollocation
 from pirl_rl.configuration import ConfigError, load_config
 from pirl_rl.evaluation import evaluate
 from pirl_rl.outer_loop.candidates import JUDGED
-from pirl_rl.outer_loop.plan import START, Result
+from pirl_rl.outer_loop.history import Result
+from pirl_rl.outer_loop.plan import START
 from pirl_rl.trainer import Trainer
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from pirl_rl.outer_loop.plan import START, History, Result
+from pirl_rl.outer_loop.history import History, Result
+from pirl_rl.outer_loop.plan import START
 
 COLORS = {"done": "#dcebdc", "worse": "#f6e7c8", "collapsed": "#f3cfc4", "failed": "#dddddd", START: "#d8e4f2"}
 """Of a node: "worse" is done, but with less reward than the baseline."""

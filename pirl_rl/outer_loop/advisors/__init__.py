@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from pirl_rl.outer_loop.plan import History
+from pirl_rl.outer_loop.history import History
 
 
 class AdvisorError(RuntimeError):

@@ -8,7 +8,7 @@ import stat
 from pathlib import Path
 
 from pirl_rl.outer_loop.advisors import AdvisorError
-from pirl_rl.outer_loop.plan import MAX_ANSWER
+from pirl_rl.outer_loop.parsing import MAX_ANSWER
 
 
 def read_answer(path: Path, limit: int = MAX_ANSWER) -> str:

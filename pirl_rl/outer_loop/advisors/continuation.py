@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from pirl_rl.outer_loop.plan import START, History, Result
+from pirl_rl.outer_loop.history import History, Result
+from pirl_rl.outer_loop.plan import START
 
 
 def starts(history: History, count: int) -> list[Result]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pirl_rl.outer_loop.advisors import AdvisorError, Request
 from pirl_rl.outer_loop.advisors.answer import read_answer
-from pirl_rl.outer_loop.plan import MAX_ANSWER
+from pirl_rl.outer_loop.parsing import MAX_ANSWER
 
 MAX_FILE = 10 * MAX_ANSWER
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pirl_rl.outer_loop.advisors import Request
 from pirl_rl.outer_loop.advisors.continuation import rounded, sigmoid, starts
-from pirl_rl.outer_loop.plan import Candidate, History, Plan, Result
+from pirl_rl.outer_loop.history import History, Result
+from pirl_rl.outer_loop.plan import Candidate, Plan
 
 FIRST = 1e-3
 """Where a weight begins that was zero: the order of the paper's first."""

@@ -8,7 +8,8 @@ from typing import Literal
 
 from pirl_rl.outer_loop.advisors import Request
 from pirl_rl.outer_loop.advisors.continuation import rounded, sigmoid, starts
-from pirl_rl.outer_loop.plan import Candidate, History, Plan, Result
+from pirl_rl.outer_loop.history import History, Result
+from pirl_rl.outer_loop.plan import Candidate, Plan
 
 try:
     import optuna

@@ -1,0 +1,97 @@
+"""From an advisor's answer to a plan.
+
+An answer is text from outside. It becomes a `Plan` only through `parse_plan`; nothing else of it is ever used. Its
+names are directory names, its checkpoints are looked up among those on offer and never read as paths.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+
+from pydantic import ValidationError
+
+from pirl_rl.outer_loop.history import History
+from pirl_rl.outer_loop.plan import START, Plan
+
+MAX_ANSWER = 200_000
+"""Characters of the longest answer that is read."""
+
+
+class PlanError(ValueError):
+    """An answer that is no plan; `errors` says what is wrong, one line each."""
+
+    def __init__(self, errors: Sequence[str]):
+        super().__init__("; ".join(errors))
+        self.errors = list(errors)
+
+
+def parse_plan(answer: str, history: History, count: int) -> Plan:
+    """The plan in an answer: a JSON object, alone or in one fenced block.
+
+    Args:
+        answer: any text.
+        history: what the plan may start from and must not repeat.
+        count: candidates that were asked for.
+
+    Raises:
+        PlanError: with every reason.
+    """
+    if len(answer) > MAX_ANSWER:
+        raise PlanError([f"answer: expected at most {MAX_ANSWER:,} characters, got {len(answer):,}"])
+    fenced = re.fullmatch(r"\s*```(?:json)?\s*\n(.*)\n```\s*", answer, re.DOTALL)
+    try:
+        plan = Plan.model_validate(json.loads(fenced[1] if fenced else answer))
+    except ValidationError as error:
+        raise PlanError([_told(detail) for detail in error.errors()[:20]]) from None
+    except (ValueError, RecursionError) as error:  # also an integer of too many digits
+        raise PlanError([f"answer: expected one JSON object, got no JSON: {error}"]) from None
+    errors = [*_count_errors(plan, count), *_start_errors(plan, history), *_repeat_errors(plan, history)]
+    if errors:
+        raise PlanError(errors)
+    return plan
+
+
+def _told(detail) -> str:
+    place = ".".join(str(part) for part in detail["loc"]) or "answer"
+    return f"{place}: {detail['msg']}, got {repr(detail['input'])[:80]}"
+
+
+def _count_errors(plan: Plan, count: int) -> list[str]:
+    names = [candidate.name for candidate in plan.candidates]
+    errors = [f"candidates: the name {name} stands twice" for name in sorted(set(names)) if names.count(name) > 1]
+    if len(names) != count:
+        errors.append(f"candidates: expected exactly {count}, got {len(names)}")
+    return errors
+
+
+def _start_errors(plan: Plan, history: History) -> list[str]:
+    known = history.checkpoints
+    errors = []
+    for candidate in plan.candidates:
+        start = known.get(candidate.start_checkpoint)
+        if start is None:
+            offered = ", ".join(known)
+            errors.append(
+                f"{candidate.name}.start_checkpoint: expected one of {offered}, got {candidate.start_checkpoint[:80]!r}"
+            )
+            continue
+        for name in ("collocation_jitter", "collocation_replay_share"):
+            if getattr(candidate, name) is not None and getattr(start, name) is None:
+                errors.append(f"{candidate.name}.{name}: the run's collocation has no such setting, leave it out")
+    restarts = [candidate.name for candidate in plan.candidates if candidate.start_checkpoint == START]
+    if len(restarts) > 1 and any(history.keeps(result) for result in history.results):
+        errors.append(f"candidates: at most one may restart from {START!r} once others succeeded, got {restarts}")
+    return errors
+
+
+def _repeat_errors(plan: Plan, history: History) -> list[str]:
+    """A combination of start, weights and jitter is run again only where the note says why, by the candidate's name."""
+    before = {result.candidate.settings for result in history.results if result.candidate is not None}
+    return [
+        f"{candidate.name}: repeats an earlier combination of start, weights and jitter; change it, or say why in "
+        f"round_note, naming {candidate.name}"
+        for candidate in plan.candidates
+        if candidate.settings in before and candidate.name not in plan.round_note
+    ]
