@@ -1,4 +1,4 @@
-"""What an advisor answers: a round's candidates, with the field names of the paper's appendix on scheduling by an agent."""
+"""What an advisor answers: a round's candidates; the field names are those of the paper's appendix on scheduling."""
 
 from __future__ import annotations
 
