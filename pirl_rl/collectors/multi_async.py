@@ -64,6 +64,7 @@ class MultiAsyncCollector:
         self._env, self._workers, self._random_warmup = env, workers, True
         self._frames_per_batch, self._transitions = frames_per_batch, Transitions(n_steps)
         self._collector: Any = None
+        self._write_lock = self.buffer._write_lock
         storage: Any = self.buffer.storage
         weakref.finalize(self, shutil.rmtree, storage.scratch_dir, ignore_errors=True)
         self._delivered, self._delivered_at = 0, 0.0
@@ -96,8 +97,9 @@ class MultiAsyncCollector:
         recipes = [self._env.recipe(seed) for seed in seeds]
         self._copy = copy.deepcopy(self._actor).cpu()
         self._policy = exploring_policy(self._copy, self._exploration)
-        # A generator's state does not survive the way into a spawned process.
+        # A generator's state does not survive the way into a spawned process, nor is a worker to watch itself.
         self.buffer.set_rng(None)
+        self.buffer._write_lock = self._write_lock
         try:
             self._collector = torchrl_collectors.MultiAsyncCollector(
                 [partial(_worker_env, recipe, os.getpid()) for recipe in recipes],
@@ -113,6 +115,7 @@ class MultiAsyncCollector:
         except RuntimeError as error:
             raise CollectorError(f"rollout workers did not start, see their messages above: {error}") from None
         self.buffer.set_rng(self._rng)
+        self.buffer._write_lock = _WatchedLock(self._write_lock, self._check_workers)  # type: ignore[assignment]
         self._collector.set_seed(self._seed)
         self._collector.start()
         self._delivered_at = time.monotonic()
@@ -147,6 +150,25 @@ class MultiAsyncCollector:
             self._delivered, self._delivered_at = delivered, now
         elif now - self._delivered_at > self.patience:
             raise CollectorError(f"{len(processes)} rollout workers delivered nothing for {self.patience:.0f} s")
+
+
+class _WatchedLock:
+    """The lock of a shared buffer, without which nothing is sampled: a worker may die while it holds it.
+
+    Args:
+        lock: between processes.
+        check: called every second of waiting; raises where there is nothing to wait for.
+    """
+
+    def __init__(self, lock: Any, check: Callable[[], None]):
+        self._lock, self._check = lock, check
+
+    def __enter__(self) -> None:
+        while not self._lock.acquire(timeout=1.0):
+            self._check()
+
+    def __exit__(self, *error: object) -> None:
+        self._lock.release()
 
 
 def _worker_env(recipe: Callable[[], ReachAvoidEnv], learner: int) -> ReachAvoidEnv:

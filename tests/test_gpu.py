@@ -1,0 +1,77 @@
+"""The same on a CUDA device: physics, losses, training, runs that change machines."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from small import command, resumed, small_trainer
+
+from pirl_rl.evaluation.monte_carlo import monte_carlo
+from pirl_rl.problems import Reach1D, VehicleDrift
+from pirl_rl.runs import load_run
+
+pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
+
+DRIFT = ("+experiment=drift", "+debug=drift", "evaluation.during=[]")
+
+
+@pytest.mark.parametrize("problem", [Reach1D(), VehicleDrift()], ids=["reach1d", "drift"])
+def test_the_physics_is_the_same(problem):
+    """In float64, so that only the order of sums differs."""
+    rng = torch.Generator().manual_seed(0)
+    x = problem.states.sample(1_000, rng, torch.float64)
+    u = problem.controls.sample(1_000, rng, torch.float64)
+    for name in ("drift", "diffusion"):
+        expected, got = getattr(problem, name)(x, u), getattr(problem, name)(x.cuda(), u.cuda())
+        torch.testing.assert_close(got.cpu(), expected, rtol=1e-9, atol=1e-9)
+    for name in ("target_level", "boundary_value", "unreachable"):
+        torch.testing.assert_close(getattr(problem, name)(x.cuda()).cpu(), getattr(problem, name)(x))
+
+
+def test_success_probabilities_are_the_exact_ones():
+    """10,000 paths a state: four standard errors are 0.02."""
+    problem = Reach1D()
+    x = torch.linspace(-1, 1, 9, device="cuda").unsqueeze(-1)
+    tau = torch.full((9,), problem.horizon, device="cuda")
+    estimate = monte_carlo(problem, problem.optimal_control, tau, x, rollouts=10_000)
+    assert estimate.probability.is_cuda
+    torch.testing.assert_close(estimate.probability, problem.exact_value(tau, x), rtol=0, atol=0.02)
+
+
+@pytest.mark.parametrize("compiled", [False, True], ids=["eager", "compiled"])
+@pytest.mark.parametrize("experiment", [(), DRIFT], ids=["reach1d", "drift"])
+def test_training_and_its_run_on_a_machine_without(experiment, compiled, tmp_path):
+    trainer = small_trainer(tmp_path / "run", *experiment, "device=cuda", f"compile={compiled}", "trainer.updates=6")
+    before = [parameter.clone() for parameter in trainer.learner.loss.parameters()]
+    assert all(parameter.is_cuda for parameter in before)
+    trainer.train()
+    assert any((a != b).any() for a, b in zip(before, trainer.learner.loss.parameters(), strict=True))
+    here, there = (load_run(tmp_path / "run", device=device) for device in ("cpu", "cuda"))
+    x = here.problem.states.sample(200, torch.Generator().manual_seed(2))
+    for name in ("value", "policy"):
+        torch.testing.assert_close(
+            getattr(there, name)(1.0, x.cuda()).cpu(), getattr(here, name)(1.0, x), rtol=1e-3, atol=1e-4
+        )
+
+
+def test_a_run_goes_on_elsewhere(tmp_path):
+    small_trainer(tmp_path, "device=cuda", "trainer.updates=4").train()
+    for device, updates in (("cpu", 6), ("cuda", 8)):
+        trainer = resumed(tmp_path, f"device={device}", f"trainer.updates={updates}")
+        trainer.train()
+        assert trainer.update == updates
+
+
+def test_workers_play_on_the_cpu_for_a_learner_on_the_device(tmp_path):
+    asynchronous = ("collector=multi_async", "collector.updates_per_batch=2", "collector.warmup_frames=128")
+    trainer = small_trainer(tmp_path, *asynchronous, "device=cuda", "trainer.updates=6")
+    trainer.train()
+    assert trainer.update == 6
+
+
+def test_commands(tmp_path):
+    quick = ("+experiment=reach1d", "+debug=default", "device=cuda", "hydra.run.dir=run")
+    done = command(*quick, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    done = command("run=run", "device=cuda", cwd=tmp_path, module="pirl_rl.evaluate")
+    assert done.returncode == 0, done.stderr
