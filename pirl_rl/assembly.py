@@ -39,9 +39,11 @@ def pick_device(name: str) -> torch.device:
 
 def make_loss(config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[str] = ()) -> PIRLLoss:
     """Fresh networks in their loss."""
-    actor = build(config.actor, "actor", trust, problem=problem)
+    # First the device, then the loss: it shares their parameters, but a later move would leave it buffers of its own.
+    device = pick_device(config.device)
+    actor = build(config.actor, "actor", trust, problem=problem).to(device)
     count = convert(config.critics, Literal[1, 2], "critics")
-    critics = [build(config.critic, "critic", trust, problem=problem) for _ in range(count)]
+    critics = [build(config.critic, "critic", trust, problem=problem).to(device) for _ in range(count)]
     with warnings.catch_warnings():
         # The learner's SoftUpdate comes later, or never where nothing is trained.
         warnings.filterwarnings("ignore", message="No target network updater")
@@ -54,7 +56,7 @@ def make_loss(config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[st
             critics=critics,
             simulator=_simulator(config, problem),
         )
-    return loss.to(pick_device(config.device))
+    return loss.to(device)
 
 
 def _simulator(config: DictConfig, problem: ReachAvoidProblem) -> Simulator:

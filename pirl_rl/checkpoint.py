@@ -6,6 +6,7 @@ so that a foreign file runs no code.
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,14 @@ def loss_state(state: dict[str, Any]) -> dict[str, Any]:
     loss = state.get("learner", state)["loss"]
     own = {name: entry for name, entry in loss.items() if "network_params" in name and not name.startswith(TARGET)}
     return {f"{TARGET}{name}": entry for name, entry in own.items()} | loss
+
+
+def restore_rng(generator: torch.Generator, state: torch.Tensor) -> None:
+    """Put a generator where it was; one of another kind of device has other states, and begins from a seed of this."""
+    if len(state) == len(generator.get_state()):
+        generator.set_state(state)
+    else:
+        generator.manual_seed(zlib.crc32(state.numpy().tobytes()))
 
 
 def newest(run: Path) -> Path:

@@ -267,7 +267,7 @@ class Trainer:
         self.collector.load_state_dict(state["collector"])
         if self.rollback is not None and state.get("rollback") is not None:
             self.rollback.load_state_dict(state["rollback"])
-        self.rng.set_state(state["rng"])
+        checkpoint.restore_rng(self.rng, state["rng"])
         torch.set_rng_state(state["torch_rng"])
-        if state["cuda_rng"] and torch.cuda.is_available():
+        if len(state["cuda_rng"]) == torch.cuda.device_count():
             torch.cuda.set_rng_state_all(state["cuda_rng"])

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -24,14 +25,16 @@ EVENTS = (
     *("trainer.log_every=3", "trainer.evaluate_every=4", "trainer.checkpoint_every=5"),
 )
 
+DRIFT = ("+experiment=drift", "+debug=drift", "evaluation.during=[]", "evaluation.final=[]")
 
-def small_config(*overrides: str):
+
+def small_config(*overrides: str, base: Sequence[str] = QUICK):
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("train", [*QUICK, *overrides])
+        return compose("train", [*base, *overrides])
 
 
-def small_trainer(folder: Path, *overrides: str) -> Trainer:
-    config = small_config(*EVENTS, *overrides)
+def small_trainer(folder: Path, *overrides: str, base: Sequence[str] = (*QUICK, *EVENTS)) -> Trainer:
+    config = small_config(*overrides, base=base)
     save_config(config, folder)
     return make_trainer(config, folder)
 

@@ -15,7 +15,7 @@ import torch
 from small import resumed, small_trainer
 
 from pirl_rl import load_run
-from pirl_rl.checkpoint import LAST, CheckpointError, load, save
+from pirl_rl.checkpoint import LAST, CheckpointError, load, restore_rng, save
 
 STATE = {"loss": {"weight": torch.arange(1000.0)}, "update": 3, "rng": torch.get_rng_state(), "names": ("a", 1, None)}
 
@@ -88,6 +88,17 @@ def test_a_link_under_the_drafts_name_is_not_followed(tmp_path):
     (tmp_path / f".{LAST}.draft").symlink_to(precious)
     save(STATE, tmp_path / LAST)
     assert precious.read_text() == "mine"
+
+
+def test_generators_go_on_and_another_device_s_begins_anew():
+    one, other, another = (torch.Generator().manual_seed(seed) for seed in (1, 2, 3))
+    restore_rng(other, one.get_state())
+    assert torch.equal(torch.rand(3, generator=other), torch.rand(3, generator=one))
+    draws = []
+    for state in (torch.zeros(16, dtype=torch.uint8), torch.ones(16, dtype=torch.uint8)):  # as CUDA's
+        restore_rng(another, state)
+        draws.append(torch.rand(3, generator=another))
+    assert not torch.equal(*draws)
 
 
 def test_every_checkpoint_of_a_killed_writer_loads(tmp_path):

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
-from small import command, resumed, small_trainer
+from small import DRIFT, EVENTS, QUICK, command, resumed, small_trainer
 
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.problems import Reach1D, VehicleDrift
 from pirl_rl.runs import load_run
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
-
-DRIFT = ("+experiment=drift", "+debug=drift", "evaluation.during=[]")
 
 
 @pytest.mark.parametrize("problem", [Reach1D(), VehicleDrift()], ids=["reach1d", "drift"])
@@ -39,9 +37,10 @@ def test_success_probabilities_are_the_exact_ones():
 
 
 @pytest.mark.parametrize("compiled", [False, True], ids=["eager", "compiled"])
-@pytest.mark.parametrize("experiment", [(), DRIFT], ids=["reach1d", "drift"])
-def test_training_and_its_run_on_a_machine_without(experiment, compiled, tmp_path):
-    trainer = small_trainer(tmp_path / "run", *experiment, "device=cuda", f"compile={compiled}", "trainer.updates=6")
+@pytest.mark.parametrize("base", [QUICK + EVENTS, DRIFT], ids=["reach1d", "drift"])
+def test_training_and_its_run_on_a_machine_without(base, compiled, tmp_path):
+    changes = ("device=cuda", f"compile={compiled}", "trainer.updates=6")
+    trainer = small_trainer(tmp_path / "run", *changes, base=base)
     before = [parameter.clone() for parameter in trainer.learner.loss.parameters()]
     assert all(parameter.is_cuda for parameter in before)
     trainer.train()

@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
+from pirl_rl.checkpoint import restore_rng
 from pirl_rl.collectors.transitions import TRANSITION
 from pirl_rl.envs import ReachAvoidEnv
 
@@ -79,4 +80,4 @@ def load_buffer(buffer: TensorDictReplayBuffer, rng: torch.Generator, state: dic
         transitions = TensorDict(state["transitions"]).auto_batch_size_(1)
         buffer.extend(transitions.to(rng.device))
     buffer.writer.load_state_dict(state["writer"])
-    rng.set_state(state["rng"])
+    restore_rng(rng, state["rng"])

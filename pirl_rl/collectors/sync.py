@@ -7,6 +7,7 @@ from typing import Any, Literal
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 
+from pirl_rl.checkpoint import restore_rng
 from pirl_rl.collectors.buffers import buffer_state, check_sizes, fill_buffer, load_buffer, make_buffer
 from pirl_rl.collectors.transitions import Exploration, Transitions, exploring_policy
 from pirl_rl.envs import ReachAvoidEnv
@@ -99,7 +100,7 @@ class SyncCollector:
         # TorchRL saves no environment state; the carried TensorDict is all that a ReachAvoidEnv has.
         self._load_frames(state["frames"])
         self._collector._carrier.update(TensorDict(state["carrier"], device=self.env.device))
-        self.env.rng.set_state(state["env_rng"])
+        restore_rng(self.env.rng, state["env_rng"])
 
     def _load_frames(self, frames: int) -> None:
         self._collector.load_state_dict({**self._collector.state_dict(), "frames": frames})  # type: ignore[arg-type]

@@ -60,7 +60,7 @@ class Transitions:
         reward, ended = following["reward"], following["terminated"]
         total = reward.clone()
         # TorchRL's MultiStep moves the next state but not its `terminated`, and would bootstrap from absorbed states.
-        end = torch.arange(batch.shape[1], device=batch.device).expand(batch.shape).unsqueeze(-1)
+        end = torch.arange(batch.shape[1], device=ended.device).expand(batch.shape).unsqueeze(-1)
         for _ in range(self.n_steps - 1):
             more = ~ended.gather(1, end) & (end < batch.shape[1] - 1)
             end = end + more
