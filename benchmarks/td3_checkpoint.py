@@ -1,0 +1,55 @@
+"""The paper's TD3 networks as a run to start from.
+
+    python benchmarks/td3_checkpoint.py WEIGHTS.npz FOLDER
+
+FOLDER becomes a run directory of `drift_td3_random` that holds weights alone: `load_run` opens it, `train start=FOLDER`
+and `tune start=FOLDER` go on from it.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+from hydra import compose, initialize_config_dir
+
+from pirl_rl import checkpoint
+from pirl_rl.assembly import make_loss
+from pirl_rl.configuration import CONF, save_config
+from pirl_rl.problems import VehicleDrift
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("weights", type=Path)
+    parser.add_argument("folder", type=Path)
+    arguments = parser.parse_args()
+    if arguments.folder.exists():
+        parser.error(f"{arguments.folder} exists")
+    with np.load(arguments.weights, allow_pickle=False) as file:
+        weights = {name: torch.from_numpy(file[name]) for name in file.files if name.endswith(("weight", "bias"))}
+        update = int(file["itr"])
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("train", ["+experiment=drift_td3_random", "device=cpu"])
+    loss = make_loss(config, VehicleDrift())
+    state = loss.state_dict()
+    for kind in ("weight", "bias"):
+        for layer in range(3):  # ours begin with the scaling of the inputs
+            state[f"actor_network_params.module.layers.{2 * layer + 1}.{kind}"] = weights[
+                f"actor.net.{2 * layer}.{kind}"
+            ]
+        for layer in range(4):
+            twins = [weights[f"critic.{twin}_net.net.{2 * layer}.{kind}"] for twin in ("q1", "q2")]
+            state[f"qvalue_network_params.module.layers.{2 * layer + 1}.{kind}"] = torch.stack(twins)
+    own = {name: entry for name, entry in state.items() if not name.startswith(checkpoint.TARGET)}
+    loss.load_state_dict(checkpoint.loss_state({"loss": own}))
+    save_config(config, arguments.folder)
+    checkpoint.save(
+        {"loss": own, "update": update}, checkpoint.weights_path(arguments.folder / checkpoint.FOLDER, update)
+    )
+
+
+if __name__ == "__main__":
+    main()
