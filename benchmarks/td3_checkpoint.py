@@ -36,7 +36,7 @@ def main() -> None:
     loss = make_loss(config, VehicleDrift())
     state = loss.state_dict()
     for kind in ("weight", "bias"):
-        for layer in range(3):  # ours begin with the scaling of the inputs
+        for layer in range(3):
             state[f"actor_network_params.module.layers.{2 * layer + 1}.{kind}"] = weights[
                 f"actor.net.{2 * layer}.{kind}"
             ]

@@ -18,18 +18,7 @@ from pirl_rl.outer_loop.advisors.command import TAIL, Command
 from pirl_rl.outer_loop.parsing import PlanError, parse_plan
 from pirl_rl.outer_loop.prompt import asked
 
-AGENT = """
-import json, sys
-prompt, plan = sys.argv[1:]
-text = open(prompt, encoding="utf-8").read()
-record = json.loads(text.rsplit("```json", 1)[1].split("```")[0])
-last = record["rounds"][-1]["results"][0] if record["rounds"] else record["baseline"]
-td, hjb, boundary = last["weights"]
-note = "again" if "was refused" in text else "first"
-one = dict(name="a", start_checkpoint=last["checkpoint"], schedule_initial=[td, hjb, boundary],
-           schedule_final=[td, 3 * hjb, boundary], schedule_center=500, schedule_sharpness=0.02)
-json.dump(dict(round_note=note, candidates=[one]), open(plan, "w"))
-"""
+AGENT = (Path(__file__).parent / "agent.py").read_text()
 
 
 @pytest.fixture
