@@ -46,6 +46,9 @@ OWN = ("start", "out", "advisor", *COUNTS)
 PLANNED = ("schedule", "stages", "resume", "trainer.updates", "evaluation.final")
 """Settings that the loop gives to its candidates."""
 
+EVALUATIONS = 10
+"""Of a candidate, at least: the guard, which stops one that collapses, sees nothing between them."""
+
 JUDGES = ("success", "residuals", "calibration")
 """Evaluators of baseline and candidates."""
 
@@ -57,7 +60,7 @@ def tune(config: DictConfig) -> None:
     out = Path(HydraConfig.get().runtime.output_dir)
     with told(out), _tidy(out), _resumable(out):
         counts = {name: _count(config, name) for name in COUNTS}
-        train = _for_training(typed)
+        train = [*_for_training(typed), *_often_enough(config)]
         trust = [*config.trust, *named_modules(typed)]
         advisor = build(config.advisor, "advisor", trust)
         trainer, path, final = _first(config, train, trust)
@@ -127,6 +130,12 @@ def _for_training(typed: Sequence[str]) -> list[str]:
         if not any(_within(key, name) for name in OWN):
             kept.append(text)
     return kept
+
+
+def _often_enough(config: DictConfig) -> list[str]:
+    """An experiment made for longer runs is evaluated more often here."""
+    every, most = config.trainer.evaluate_every, max(1, config.updates // EVALUATIONS)
+    return [f"trainer.evaluate_every={most}"] if isinstance(every, int) and every > most else []
 
 
 def _within(key: str, name: str) -> bool:

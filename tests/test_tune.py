@@ -54,6 +54,7 @@ def test_command_line(cli, trained, tmp_path):
         assert words[4] == "trainer.rollback=true"
         assert words[5 : 5 + len(SMALL)] == list(SMALL)
         assert {"evaluation.final=[success,residuals,calibration]", "trainer.updates=10", "seed=1"} <= {*words}
+        assert "trainer.evaluate_every=1" in words
         assert f"start='{trained / 'checkpoints' / 'last.pt'}'" in words
 
     code, text = cli(*typed, "seed=4", "advisor.growth=3")
