@@ -39,6 +39,17 @@ def test_optuna_improves_on_its_start_and_repeats_itself_exactly():
     assert searched(Optuna(seed=1), 1) != searched(Optuna(), 1)
 
 
+def test_no_round_of_a_seed_repeats_one_of_another():
+    weights = []
+    for seed in range(4):
+        advisor, record = Optuna("random", seed=seed), history()
+        for _ in range(4):
+            one = json.loads(advisor.propose(request(record, candidates=1)))["candidates"][0]
+            weights.append(tuple(one["schedule_final"]))
+            record = after(record, json.dumps({"round_note": "", "candidates": [one]}), 1, valley)
+    assert len(set(weights)) == len(weights)
+
+
 def test_optuna_learns_from_the_record_and_random_does_not():
     """The same candidates with their fates turned round."""
     for sampler, same in [("tpe", False), ("random", True)]:

@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
+import numpy as np
+
 from pirl_rl.outer_loop.advisors import Request
 from pirl_rl.outer_loop.advisors.continuation import rounded, sigmoid, starts
 from pirl_rl.outer_loop.history import History, Result
@@ -31,7 +33,7 @@ class Optuna:
 
     Args:
         sampler: "tpe", a tree-structured Parzen estimator, or "random".
-        seed: of the sampler, with the round's number added; >= 0.
+        seed: of the sampler, >= 0; each round of each seed has a stream of its own.
         startup: finished candidates before TPE takes over from random draws.
         weights: least and largest final weight, 0 < least < largest <= 1000.
         jitter: largest jitter, 0 < jitter <= 1.
@@ -73,13 +75,11 @@ class Optuna:
         for number, start in enumerate(starts(request.history, request.candidates), 1):
             values = study.ask(self._space(start)).params
             chosen.append(_candidate(values, start, f"trial-{number}", request.updates))
-        note = (
-            f"{self.sampler} sampler, seed {self.seed + request.number}, {len(study.trials) - len(chosen)} trials known"
-        )
+        note = f"{self.sampler} sampler, seed {self.seed}, {len(study.trials) - len(chosen)} trials known"
         return Plan(round_note=note, candidates=chosen).model_dump_json(indent=1, exclude_none=True)
 
     def _sampler(self, number: int) -> BaseSampler:
-        seed = self.seed + number
+        seed = int(np.random.SeedSequence([self.seed, number]).generate_state(1)[0])
         return RandomSampler(seed) if self.sampler == "random" else TPESampler(seed=seed, n_startup_trials=self.startup)
 
     def _space(self, start: Result) -> dict[str, BaseDistribution]:
