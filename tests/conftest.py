@@ -3,8 +3,18 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import pytest
+from small import small_trainer
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    """A run to start from."""
+    folder = tmp_path_factory.mktemp("trained")
+    small_trainer(folder, "trainer.updates=20").train()
+    return folder
 
 
 @pytest.fixture

@@ -25,6 +25,8 @@ EVENTS = (
     *("trainer.log_every=3", "trainer.evaluate_every=4", "trainer.checkpoint_every=5"),
 )
 
+TUNED = ("+experiment=reach1d", "+debug=default", "env.num_envs=32", "collector.frames_per_batch=64")
+TUNED += ("collector.warmup_frames=64",)
 DRIFT = ("+experiment=drift", "+debug=drift", "evaluation.during=[]", "evaluation.final=[]")
 
 

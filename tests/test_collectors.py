@@ -175,14 +175,33 @@ def test_workers_feed_resume_die_and_leave_nothing(tmp_path):
             until(lambda: collector.buffer.write_count > written + 600)
         if k == 20:
             processes.extend(collector._collector.procs)
-            collector._write_lock.acquire()  # as if the worker held it: the learner must not wait for it
-            os.kill(processes[1].pid, signal.SIGKILL)
-            until(lambda: not processes[1].is_alive())
+            with collector._write_lock:  # which the worker then does not hold
+                os.kill(processes[1].pid, signal.SIGKILL)
+                until(lambda: not processes[1].is_alive())
 
     collector.step = step_and_kill
     with pytest.raises(CollectorError, match="worker 1 of 2 died, exit code -9"):
         second.train()
-    assert second.update == 20
+    assert second.update == 21
+    assert not multiprocessing.active_children()
+
+
+def test_a_worker_that_dies_with_the_buffer_s_lock_is_noticed(tmp_path):
+    trainer = small_trainer(tmp_path, *ASYNC, "trainer.updates=1000000")
+    collector = trainer.collector
+    step = collector.step
+
+    def step_and_kill(k: int) -> None:
+        step(k)
+        if k == 3:
+            assert collector._write_lock.acquire(timeout=60)  # in the worker's place, and never released
+            os.kill(collector._collector.procs[0].pid, signal.SIGKILL)
+            until(lambda: not collector._collector.procs[0].is_alive())
+
+    collector.step = step_and_kill
+    with pytest.raises(CollectorError, match="worker 0 of 2 died, exit code -9"):
+        trainer.train()
+    assert trainer.update == 3
     assert not multiprocessing.active_children()
 
 

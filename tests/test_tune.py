@@ -5,27 +5,15 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-from pathlib import Path
 
 import pytest
 from rounds import FakeTrain, answer, candidate
-from small import small_trainer
+from small import TUNED
 
 from pirl_rl import tune
 from pirl_rl.configuration import load_config
 from pirl_rl.outer_loop.directory import LOCK, locked
 from pirl_rl.schedules import LossSchedule
-
-SMALL = ("+experiment=reach1d", "+debug=default", "env.num_envs=32", "collector.frames_per_batch=64")
-SMALL += ("collector.warmup_frames=64",)
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory) -> Path:
-    """A run to start from."""
-    folder = tmp_path_factory.mktemp("trained")
-    small_trainer(folder, "trainer.updates=20").train()
-    return folder
 
 
 @pytest.fixture
@@ -36,7 +24,7 @@ def cli(in_process, monkeypatch):
 
 
 def test_command_line(cli, trained, tmp_path):
-    typed = (*SMALL, f"start={trained}", "rounds=1", "out='my out'", "updates=10")
+    typed = (*TUNED, f"start={trained}", "rounds=1", "out='my out'", "updates=10")
     code, text = cli(*typed)
     assert code == 0, text
     out = tmp_path / "my out"
@@ -52,7 +40,7 @@ def test_command_line(cli, trained, tmp_path):
     for line in commands:
         words = shlex.split(line)
         assert words[4] == "trainer.rollback=true"
-        assert words[5 : 5 + len(SMALL)] == list(SMALL)
+        assert words[5 : 5 + len(TUNED)] == list(TUNED)
         assert {"evaluation.final=[success,residuals,calibration]", "trainer.updates=10", "seed=1"} <= {*words}
         assert "trainer.evaluate_every=1" in words
         assert f"start='{trained / 'checkpoints' / 'last.pt'}'" in words
@@ -104,7 +92,7 @@ def test_command_line(cli, trained, tmp_path):
 )
 def test_mistakes_are_named_and_leave_nothing(arguments, told, cli, trained, tmp_path):
     (tmp_path / "mine").touch()
-    code, text = cli(*SMALL, f"start={trained}", *arguments)
+    code, text = cli(*TUNED, f"start={trained}", *arguments)
     assert code == 1, text
     assert told in text
     assert "Traceback" not in text
@@ -114,7 +102,7 @@ def test_mistakes_are_named_and_leave_nothing(arguments, told, cli, trained, tmp
 def test_a_program_s_line_is_typed_as_for_any_shell(cli, trained, tmp_path):
     (tmp_path / "my plan.json").write_text(answer(candidate("a"), candidate("b")))
     typed = shlex.split(f"""advisor=command advisor.command="cp '{tmp_path}/my plan.json' {{plan}}" """)
-    line = (*SMALL, f"start={trained}", "rounds=1", "out=out", "updates=10")
+    line = (*TUNED, f"start={trained}", "rounds=1", "out=out", "updates=10")
     code, text = cli(*line, *typed)
     assert code == 0, text
     assert "round 1 (command)" in text
