@@ -35,20 +35,18 @@ def main() -> None:
         config = compose("train", ["+experiment=drift_td3_random", "device=cpu"])
     loss = make_loss(config, VehicleDrift())
     state = loss.state_dict()
+    ours = "{}_network_params.module.layers.{}.{}"
     for kind in ("weight", "bias"):
-        for layer in range(3):
-            state[f"actor_network_params.module.layers.{2 * layer + 1}.{kind}"] = weights[
-                f"actor.net.{2 * layer}.{kind}"
-            ]
-        for layer in range(4):
-            twins = [weights[f"critic.{twin}_net.net.{2 * layer}.{kind}"] for twin in ("q1", "q2")]
-            state[f"qvalue_network_params.module.layers.{2 * layer + 1}.{kind}"] = torch.stack(twins)
+        for layer in (0, 2, 4):  # ours begin with the scaling of the inputs
+            state[ours.format("actor", layer + 1, kind)] = weights[f"actor.net.{layer}.{kind}"]
+        for layer in (0, 2, 4, 6):
+            twins = [weights[f"critic.{twin}_net.net.{layer}.{kind}"] for twin in ("q1", "q2")]
+            state[ours.format("qvalue", layer + 1, kind)] = torch.stack(twins)
     own = {name: entry for name, entry in state.items() if not name.startswith(checkpoint.TARGET)}
     loss.load_state_dict(checkpoint.loss_state({"loss": own}))
     save_config(config, arguments.folder)
-    checkpoint.save(
-        {"loss": own, "update": update}, checkpoint.weights_path(arguments.folder / checkpoint.FOLDER, update)
-    )
+    path = checkpoint.weights_path(arguments.folder / checkpoint.FOLDER, update)
+    checkpoint.save({"loss": own, "update": update}, path)
 
 
 if __name__ == "__main__":
