@@ -5,12 +5,28 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from itertools import accumulate
 
+from pirl_rl.actor_rules import ActorRule
 from pirl_rl.collocation import Collocation
 from pirl_rl.initial_states import InitialStates
 from pirl_rl.schedules import Schedule, Weights
+
+
+@dataclass(frozen=True, eq=False)
+class Settings:
+    """What a stage may set beside the loss weights; see `Stage`."""
+
+    initial_states: InitialStates
+    collocation: Collocation
+    n_steps: int
+    actor_every: int
+    model_steps: int
+    actor_rule: ActorRule
+    exploration_noise: float
+    learning_rate: float
+    train_actor: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +41,8 @@ class Stage:
         n_steps: length of returns.
         actor_every: critic updates for each update of the actor and the targets.
         model_steps: control steps that the actor's rule "model" looks ahead.
+        actor_rule: of the actor.
+        exploration_noise: deviation of the noise on played actions; where it changes, the replay buffer starts anew.
         learning_rate: a rate of its own, which decays over the stage as the run's does over the run.
         train_actor: False freezes the actor, so that the critics come to rest at the value of one policy.
     """
@@ -36,6 +54,8 @@ class Stage:
     n_steps: int | None = None
     actor_every: int | None = None
     model_steps: int | None = None
+    actor_rule: ActorRule | None = None
+    exploration_noise: float | None = None
     learning_rate: float | None = None
     train_actor: bool = True
 
@@ -46,8 +66,15 @@ class Stage:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"stage.{name}: expected at least 1, got {value}")
+        if self.exploration_noise is not None and not self.exploration_noise >= 0:
+            raise ValueError(f"stage.exploration_noise: expected a number >= 0, got {self.exploration_noise}")
         if self.learning_rate is not None and not self.learning_rate > 0:
             raise ValueError(f"stage.learning_rate: expected a number > 0, got {self.learning_rate}")
+
+    def over(self, run: Settings) -> Settings:
+        """This stage's settings, the run's where it has none."""
+        own = {field.name: getattr(self, field.name) for field in fields(Settings)}
+        return replace(run, **{name: value for name, value in own.items() if value is not None})
 
 
 class Curriculum:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ from pirl_rl.problems import VehicleDrift
 from pirl_rl.sets import Box
 
 ATTEMPTS = 1_000
+Tau = Literal["fixed", "random", "both"]
 
 
 @runtime_checkable
@@ -45,20 +46,21 @@ class UniformStates:
     Args:
         low: lower corner of the box; default the problem's `states`.
         high: upper corner.
-        tau: "fixed" starts every episode at the whole horizon, "random" at a uniform number of steps from 1.
+        tau: "fixed" starts every episode at the whole horizon, "random" at a uniform number of steps from 1, "both"
+            half of the episodes each.
     """
 
     def __init__(
         self,
         low: Sequence[float] | None = None,
         high: Sequence[float] | None = None,
-        tau: Literal["fixed", "random"] = "random",
+        tau: Tau = "random",
     ):
         _check_tau(tau)
         if (low is None) != (high is None):
             raise ValueError("initial_states: give both low and high, or neither")
         self.box = None if low is None or high is None else Box(low, high)
-        self.tau = tau
+        self.tau: Tau = tau
 
     def sample(
         self,
@@ -90,7 +92,7 @@ class EquilibriumStates:
         self,
         scale: float | Sequence[float] = 1.0,
         mixture: Sequence[float] = (0.3, 0.3, 0.4),
-        tau: Literal["fixed", "random"] = "random",
+        tau: Tau = "random",
     ):
         _check_tau(tau)
         low, high = scale if isinstance(scale, Sequence) else (scale, scale)
@@ -98,7 +100,8 @@ class EquilibriumStates:
             raise ValueError(f"initial_states.scale: expected one or two numbers, 0 <= low <= high <= 1, got {scale}")
         if len(mixture) != 3 or min(mixture) < 0 or not sum(mixture) > 0:
             raise ValueError(f"initial_states.mixture: expected three shares >= 0, got {list(mixture)}")
-        self.scale, self.mixture, self.tau = (low, high), tuple(mixture), tau
+        self.scale, self.mixture = (low, high), tuple(mixture)
+        self.tau: Tau = tau
 
     def sample(
         self,
@@ -177,14 +180,17 @@ def moved(z: Tensor, radius: float, generator: torch.Generator) -> Tensor:
 
 
 def _check_tau(tau: str) -> None:
-    if tau not in ("fixed", "random"):
-        raise ValueError(f"initial_states.tau: expected 'fixed' or 'random', got {tau!r}")
+    if tau not in get_args(Tau):
+        raise ValueError(f"initial_states.tau: expected 'fixed', 'random' or 'both', got {tau!r}")
 
 
-def _steps(tau: str, count: int, max_steps: int, generator: torch.Generator) -> Tensor:
+def _steps(tau: Tau, count: int, max_steps: int, generator: torch.Generator) -> Tensor:
     if tau == "fixed":
         return torch.full((count,), max_steps, device=generator.device)
-    return torch.randint(1, max_steps + 1, (count,), generator=generator, device=generator.device)
+    steps = torch.randint(1, max_steps + 1, (count,), generator=generator, device=generator.device)
+    if tau == "both":
+        steps[torch.rand(count, generator=generator, device=generator.device) < 0.5] = max_steps
+    return steps
 
 
 def sample_interior(

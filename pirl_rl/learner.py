@@ -12,6 +12,7 @@ from torch import Tensor
 from torch._dynamo.exc import BackendCompilerFailed
 from torchrl.objectives import SoftUpdate
 
+from pirl_rl.curriculum import Settings
 from pirl_rl.losses import PIRLLoss
 from pirl_rl.schedules import Schedule
 
@@ -64,6 +65,13 @@ class Learner:
             for name in loss.compilable:
                 setattr(loss, name, torch.compile(getattr(loss, name)))
         self._loss_actor = torch.tensor(math.nan)
+
+    def begin(self, settings: Settings) -> None:
+        """Go on as a stage of a curriculum asks."""
+        self.actor_every, self.train_actor = settings.actor_every, settings.train_actor
+        self.learning_rate = settings.learning_rate
+        self.loss.actor_rule, self.loss.model_steps = settings.actor_rule, settings.model_steps
+        self.loss.exploration_noise = settings.exploration_noise
 
     def update(self, batch: TensorDictBase, k: int, progress: float) -> dict[str, Tensor]:
         """The k-th update (from 0) on {"replay", "collocation", "boundary"}; returns the unweighted terms.

@@ -18,8 +18,9 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.objectives import TD3Loss
 
+from pirl_rl.actor_rules import ACTOR_RULES, ActorRule, check_rule
 from pirl_rl.networks import Actor, Critic
-from pirl_rl.operators import advection, generator, require_twice_differentiable
+from pirl_rl.operators import advection, generator, masked_mean, require_twice_differentiable
 from pirl_rl.problem import ReachAvoidProblem, has_controlled_noise
 from pirl_rl.simulator import Simulator
 
@@ -49,18 +50,17 @@ class PIRLLoss(TD3Loss):
         hjb_delta: HJB residuals beyond it, 1/s, count linearly (Huber), so that corners where V jumps and no network
             can follow do not outweigh the rest; None squares all, as in the paper.
         boundary_delta: the same for the error of V on the boundary.
-        actor_rule: "q" ascends Q_1(y, pi(y)), Eq. (actor_loss); "hamiltonian" ascends f(x, pi) . grad V +
-            1/2 Tr(sigma sigma^T hess V) at fixed V, the HJB equation's own rule; "both" adds them; "model" ascends V
-            at the end of `model_steps` noise-free control steps of `simulator`, what the Hamiltonian becomes where a
-            control is held.
+        actor_rule: what the actor ascends, "q", "hamiltonian", "both", "model" or "ppo", see `pirl_rl.actor_rules`.
         model_steps: control steps that "model" looks ahead.
         simulator: plays them.
+        exploration_noise: deviation of the noise of played actions, in [-1, 1] coordinates; "ppo" needs it above 0.
+        ppo_clip: "ppo" follows the ratio of densities no further than 1 -+ this from the policy that played.
         logit_penalty: factor of the mean square of the actor's outputs before their tanh, added to the actor's loss:
             where tanh saturates, no gradient would bring a wrong action back.
         td_weight, hjb_weight, boundary_weight: initial weights of the three terms.
 
     Raises:
-        ValueError: an unknown actor rule.
+        ValueError: an unknown actor rule, or one that lacks what it needs.
         TypeError: a critic with an activation that is not C^2.
     """
 
@@ -83,22 +83,18 @@ class PIRLLoss(TD3Loss):
         hjb_noise_clip: float = 1.0,
         hjb_delta: float | None = None,
         boundary_delta: float | None = None,
-        actor_rule: Literal["q", "hamiltonian", "both", "model"] = "both",
+        actor_rule: ActorRule = "both",
         model_steps: int = 1,
         simulator: Simulator | None = None,
+        exploration_noise: float = 0.0,
+        ppo_clip: float = 0.2,
         logit_penalty: float = 0.0,
         td_weight: float = 1.0,
         hjb_weight: float = 0.0,
         boundary_weight: float = 0.0,
     ):
-        if actor_rule not in ("q", "hamiltonian", "both", "model"):
-            raise ValueError(f"loss.actor_rule: expected 'q', 'hamiltonian', 'both' or 'model', got {actor_rule!r}")
-        if actor_rule in ("q", "both") and not all(critic.action_input for critic in critics):
-            raise ValueError(
-                f"loss.actor_rule: critics without the action need 'hamiltonian' or 'model', got {actor_rule!r}"
-            )
-        if actor_rule == "model" and simulator is None:
-            raise ValueError("loss.simulator: expected a simulator for actor_rule 'model', got none")
+        for critic in critics:
+            check_rule(actor_rule, critic, simulator, exploration_noise)
         if td_criterion not in TD_CRITERIA:
             raise ValueError(f"loss.td_criterion: expected one of {', '.join(TD_CRITERIA)}, got {td_criterion!r}")
         if td_criterion == "cross_entropy" and not all(isinstance(critic.layers[-1], nn.Sigmoid) for critic in critics):
@@ -132,9 +128,11 @@ class PIRLLoss(TD3Loss):
         self.td_criterion, self.target_critics = td_criterion, target_critics
         self.hjb_noise, self.hjb_noise_clip = hjb_noise, hjb_noise_clip
         self.hjb_delta, self.boundary_delta = hjb_delta, boundary_delta
-        self.actor_rule, self.model_steps, self.simulator = actor_rule, model_steps, simulator
+        self.actor_rule: ActorRule = actor_rule
+        self.model_steps, self.simulator = model_steps, simulator
+        self.exploration_noise, self.ppo_clip = exploration_noise, ppo_clip
         self.logit_penalty = logit_penalty
-        self._hamiltonian_operator = generator if has_controlled_noise(problem) else advection
+        self.hamiltonian_operator = generator if has_controlled_noise(problem) else advection
         for name, value in zip(WEIGHTS, (td_weight, hjb_weight, boundary_weight), strict=True):
             self.register_coeff_buffer(name, float(value))
 
@@ -161,16 +159,16 @@ class PIRLLoss(TD3Loss):
         if self.logit_penalty:
             with self._actor() as actor:
                 loss = loss + self.logit_penalty * actor.logits(tau, x).square().mean()
-        if self.actor_rule == "model":
-            return loss - self._look_ahead(tau, x), {}
-        if self.actor_rule in ("q", "both"):
-            action = self.act(tau, x)
-            with self.critics("frozen") as critic:
-                loss = loss - critic(tau, x, action)[0].mean()
-        if self.actor_rule in ("hamiltonian", "both"):
-            points = batch["collocation"] if "collocation" in batch.keys() else batch["replay"]
-            loss = loss - self._hamiltonian(points)
-        return loss, {}
+        points = batch["collocation"] if "collocation" in batch.keys() else batch["replay"]
+        return loss - ACTOR_RULES[self.actor_rule](self, batch["replay"], points), {}
+
+    def check_rule(self, rule: ActorRule, exploration_noise: float) -> None:
+        """Refuse a rule of the actor that lacks what it needs.
+
+        Raises:
+            ValueError: naming it.
+        """
+        check_rule(rule, self.qvalue_network.module, self.simulator, exploration_noise)  # type: ignore[arg-type]
 
     def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """TD3Loss's name for `critic_loss`."""
@@ -245,7 +243,7 @@ class PIRLLoss(TD3Loss):
             u = self.problem.controls.denormalize(action)
         residual = self.residuals(points["tau"].squeeze(-1), points["state"], action, u)
         squares = _huber(residual, self.hjb_delta)
-        return _masked_mean(squares.sum(0), points["mask"])
+        return masked_mean(squares.sum(0), points["mask"])
 
     def _boundary_loss(self, points: TensorDictBase) -> Tensor:
         """L_BC summed over critics: the mean of (Q_i(y, pi^-(y)) - l_eps)^2."""
@@ -254,32 +252,6 @@ class PIRLLoss(TD3Loss):
         with self.critics() as critic:
             value = critic(points["tau"], points["state"], action).squeeze(-1)
         return _huber(value - points["value"], self.boundary_delta).sum(0).mean()
-
-    def _hamiltonian(self, points: TensorDictBase) -> Tensor:
-        """Mean over points of f(x, u) . grad V + 1/2 Tr(sigma sigma^T hess V) and a term without u, Eq. (generator).
-
-        V is the mean critic at the frozen action; u is the actor's output with its gradient.
-        """
-        tau, x = points["tau"], points["state"]
-        action = self.act(tau, x)
-        u = self.problem.controls.denormalize(action)
-        with self.critics("frozen") as critic:
-            value = self._hamiltonian_operator(critic.at(action.detach()), self.problem, tau.squeeze(-1), x, u).mean(0)
-        mask = points["mask"] if "mask" in points.keys() else torch.ones_like(value, dtype=torch.bool)
-        return _masked_mean(value, mask)
-
-    def _look_ahead(self, tau: Tensor, x: Tensor) -> Tensor:
-        """Mean V at the end of noise-free control steps from tau (N, 1) and x (N, n), or where they meet A or B."""
-        assert self.simulator is not None
-        dt = self.simulator.dt
-        for _ in range(self.model_steps):
-            # Half a step of tolerance: tau is a whole number of steps up to rounding.
-            live = self.problem.interior(x).unsqueeze(-1) & (tau > dt / 2)
-            moved = self.flow(x, self.problem.controls.denormalize(self.act(tau, x)))
-            tau, x = torch.where(live, tau - dt, tau), torch.where(live, moved, x)
-        with self.critics("frozen") as critic:
-            value = critic(tau, x, self.act(tau, x).detach()).mean(0).squeeze(-1)
-        return torch.where(self.problem.reached(x), torch.ones_like(value), value).mean()
 
     @staticmethod
     def _clipped_noise(like: Tensor, deviation: float, bound: float) -> Tensor:
@@ -291,7 +263,3 @@ def _huber(residual: Tensor, delta: float | None) -> Tensor:
     if delta is None:
         return residual.square()
     return 2 * nn.functional.huber_loss(residual, torch.zeros_like(residual), reduction="none", delta=delta)
-
-
-def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    return torch.where(mask, values, torch.zeros_like(values)).sum() / mask.sum().clamp(min=1)

@@ -136,3 +136,8 @@ def require_twice_differentiable(layers: nn.Sequential) -> None:
                 f"critic: the HJB residual takes second derivatives, so every activation must be C^2; "
                 f"expected one of {known}, got {type(layer).__name__}"
             )
+
+
+def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Mean of the values where the mask is true, 0 where it nowhere is; shapes stay fixed, as a compiler likes it."""
+    return torch.where(mask, values, torch.zeros_like(values)).sum() / mask.sum().clamp(min=1)

@@ -16,7 +16,7 @@ from tensordict import TensorDict
 from pirl_rl import checkpoint
 from pirl_rl.collectors import TransitionCollector
 from pirl_rl.collocation import BoundarySampler, Collocation
-from pirl_rl.curriculum import Curriculum
+from pirl_rl.curriculum import Curriculum, Settings
 from pirl_rl.evaluation import Evaluator, Success, evaluate
 from pirl_rl.files import replacing
 from pirl_rl.guard import Rollback
@@ -90,8 +90,19 @@ class Trainer:
                 raise ValueError(f"trainer.{name}: expected an integer >= {least}, got {value!r}")
         self.learner, self.collector, self.collocation, self.boundary = learner, collector, collocation, boundary
         self.stages = stages or Curriculum(learner.schedule, updates)
-        rates = learner.actor_every, learner.loss.model_steps, learner.learning_rate
-        self._unstaged = collector.initial_states, collector.n_steps, collocation, *rates
+        self._unstaged = Settings(
+            initial_states=collector.initial_states,
+            collocation=collocation,
+            n_steps=collector.n_steps,
+            actor_every=learner.actor_every,
+            model_steps=learner.loss.model_steps,
+            actor_rule=learner.loss.actor_rule,
+            exploration_noise=collector.exploration_noise,
+            learning_rate=learner.learning_rate,
+        )
+        for stage in self.stages.stages:
+            settings = stage.over(self._unstaged)
+            learner.loss.check_rule(settings.actor_rule, settings.exploration_noise)
         self.updates, self.batch_size = updates, batch_size
         self.log_every, self.evaluate_every, self.checkpoint_every = log_every, evaluate_every, checkpoint_every
         self.during, self.final = tuple(during), tuple(final)
@@ -183,13 +194,10 @@ class Trainer:
 
     def _begin_stage(self) -> None:
         """Take over what the stage of the next update sets, and the run's own for the rest."""
-        stage = self.stages.stages[self.stages.index(self.update)]
-        initial_states, n_steps, collocation, actor_every, model_steps, learning_rate = self._unstaged
-        self.collector.play(stage.initial_states or initial_states, stage.n_steps or n_steps)
-        self.collocation = stage.collocation or collocation
-        self.learner.actor_every, self.learner.train_actor = stage.actor_every or actor_every, stage.train_actor
-        self.learner.loss.model_steps = stage.model_steps or model_steps
-        self.learner.learning_rate = stage.learning_rate or learning_rate
+        settings = self.stages.stages[self.stages.index(self.update)].over(self._unstaged)
+        self.collector.play(settings.initial_states, settings.n_steps, settings.exploration_noise)
+        self.collocation = settings.collocation
+        self.learner.begin(settings)
 
     def sample(self) -> TensorDict:
         """The batch of one update; a term of negligible weight is left out of the work."""

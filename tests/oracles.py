@@ -107,6 +107,7 @@ def make_batch(problem: ReachAvoidProblem, count: int = 24) -> TensorDict:
         "tau": here[0].unsqueeze(-1),
         "state": here[1],
         "action": here[2],
+        "loc": there[2],
         "next": {
             "tau": there[0].unsqueeze(-1),
             "state": there[1],

@@ -34,7 +34,7 @@ def two_paths() -> TensorDict:
     """Five steps of two environments; the first ends an episode at its third step. Every number tells its place."""
     place = torch.tensor([[0.0, 1, 2, 3, 4], [10, 11, 12, 13, 14]]).unsqueeze(-1)
     ended = place == 2
-    here = {"tau": place, "state": place.repeat(1, 1, 2), "action": -place, "is_init": place == 3}
+    here = {"tau": place, "state": place.repeat(1, 1, 2), "action": -place, "loc": 1 - place, "is_init": place == 3}
     following = {"tau": place + 0.5, "state": place.repeat(1, 1, 2) + 0.5, "reward": 2 ** (place % 10)}
     return TensorDict({**here, "next": {**following, "terminated": ended, "done": ended}}, batch_size=[2, 5])
 
@@ -50,7 +50,7 @@ def test_returns_stop_at_ends_of_episodes_and_of_the_batch():
     assert torch.equal(three["next", "terminated"], ends == 2)
     assert torch.equal(three["next", "reward"], rewards)
     kept = two_paths().reshape(-1)
-    for key in ("tau", "state", "action"):
+    for key in ("tau", "state", "action", "loc"):
         assert torch.equal(three[key], kept[key])
 
 
@@ -60,6 +60,11 @@ def test_one_step_returns_are_the_transitions_themselves():
     assert set(one.keys(True, True)) == set(TRANSITION)
     assert (one == batch.select(*TRANSITION).reshape(-1)).all()
     assert (batch == two_paths()).all()
+
+
+def test_random_actions_are_their_own_center():
+    one = Transitions(1)(two_paths().exclude("loc"))
+    assert torch.equal(one["loc"], one["action"])
 
 
 @pytest.mark.parametrize(("n_steps", "column"), [(20, 0), (20, 12), (5, 3)])

@@ -9,6 +9,7 @@ import torch
 from small import assert_same, at_update, interrupt, resumed, small_trainer
 
 from pirl_rl import checkpoint
+from pirl_rl.configuration import ConfigError
 from pirl_rl.curriculum import Curriculum, Stage
 from pirl_rl.plots import read_metrics
 from pirl_rl.schedules import ConstantSchedule, LinearSchedule, LossSchedule
@@ -91,6 +92,58 @@ def test_resume_inside_a_stage_is_exact(tmp_path):
     ends = [checkpoint.load(tmp_path / name / checkpoint.FOLDER / checkpoint.LAST) for name in ("whole", "cut")]
     assert ends[0]["update"] == 10
     assert_same(*ends)
+
+
+POLICY = (
+    "stages=[{updates: 1, n_steps: 4}, {updates: 2, actor_rule: ppo, exploration_noise: 0.3}, "
+    "{updates: 1, exploration_noise: 0.1}]",
+    "trainer.updates=12",
+)
+
+
+@pytest.mark.parametrize("collector", ["sync", "multi_async"])
+def test_a_stage_of_policy_gradients_follows_its_own_noise_alone(collector, tmp_path):
+    trainer = small_trainer(tmp_path, *POLICY, f"collector={collector}", "collector.warmup_frames=128")
+    seen = []
+    sample = trainer.sample
+
+    def watch():
+        loss, replay = trainer.learner.loss, trainer.collector.buffer[:]
+        off = (replay["action"] - replay["loc"]).abs()
+        seen.append((loss.actor_rule, loss.exploration_noise, len(replay) >= 128, off.amax().item()))
+        return sample()
+
+    trainer.sample = watch
+    trainer.train()
+    rules = [("hamiltonian", 0.0, True)] * 3 + [("ppo", 0.3, True)] * 6 + [("hamiltonian", 0.1, True)] * 3
+    assert [one[:3] for one in seen] == rules
+    assert all(off == 0.0 for *_, off in seen[:3])
+    assert all(0.5 < off < 2.0 for *_, off in seen[3:9])
+    assert all(0.1 < off < 0.6 for *_, off in seen[9:])
+
+
+def test_resume_between_noises_is_exact(tmp_path):
+    small_trainer(tmp_path / "whole", *POLICY).train()
+    stopped = small_trainer(tmp_path / "cut", *POLICY)
+    at_update(stopped, 6, interrupt)
+    with pytest.raises(Interrupted):
+        stopped.train()
+    resumed(tmp_path / "cut", *POLICY).train()
+    assert_same(*[checkpoint.load(tmp_path / name / checkpoint.FOLDER / checkpoint.LAST) for name in ("whole", "cut")])
+
+
+@pytest.mark.parametrize(
+    ("stage", "message"),
+    [
+        ("{updates: 1, actor_rule: ppo}", "expected noise > 0 for actor_rule 'ppo', got 0.0"),
+        ("{updates: 1, actor_rule: q}", "critics without the action need"),
+        ("{updates: 1, actor_rule: sac}", "expected one of q, hamiltonian, both, model, ppo, got 'sac'"),
+        ("{updates: 1, exploration_noise: -0.1}", "exploration_noise: expected a number >= 0, got -0.1"),
+    ],
+)
+def test_a_stage_that_cannot_be_followed_is_refused_at_the_start(stage, message, tmp_path):
+    with pytest.raises(ConfigError, match=message):
+        small_trainer(tmp_path, *POLICY, f"stages=[{{updates: 1}}, {stage}]")
 
 
 def test_a_frozen_actor_stays_while_critics_and_targets_move(tmp_path):

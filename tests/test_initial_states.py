@@ -38,6 +38,8 @@ def test_uniform_over_what_is_left_of_the_box():
 def test_tau_fixed_or_uniform():
     assert (draw(Reach1D(), UniformStates(tau="fixed"))[0] == 20).all()
     counts = torch.bincount(draw(Reach1D(), UniformStates(tau="random"))[0], minlength=21)
+    share = (draw(Reach1D(), UniformStates(tau="both"))[0] == 20).double().mean().item()
+    assert share == pytest.approx(0.525, abs=5 * (0.25 / COUNT) ** 0.5)
     assert counts[0] == 0
     # Chi-squared with 19 degrees of freedom: above 43.8 with probability 1e-3.
     assert ((counts[1:] - COUNT / 20) ** 2 / (COUNT / 20)).sum() < 43.8
@@ -57,7 +59,7 @@ def test_a_box_inside_the_target_is_refused():
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"tau": "late"}, "initial_states.tau: expected 'fixed' or 'random', got 'late'"),
+        ({"tau": "late"}, "initial_states.tau: expected 'fixed', 'random' or 'both', got 'late'"),
         ({"low": [0.0]}, "give both low and high"),
         ({"low": [1.0], "high": [0.0]}, "low < high"),
     ],

@@ -277,7 +277,7 @@ def test_a_sigmoid_keeps_probabilities_and_a_linear_output_does_not():
 def test_critics_of_v_refuse_an_actor_that_ascends_q(rule):
     problem = Reach1D()
     nets = [Critic(problem, (4,)), Critic(problem, (4,), action_input=False)]
-    with pytest.raises(ValueError, match=f"need 'hamiltonian' or 'model', got '{rule}'"):
+    with pytest.raises(ValueError, match=f"need 'hamiltonian', 'model' or 'ppo', got '{rule}'"):
         PIRLLoss(problem, Actor(problem), nets, actor_rule=rule)
     PIRLLoss(problem, Actor(problem), nets[1:], actor_rule="hamiltonian")
 
@@ -351,6 +351,66 @@ def test_look_ahead_by_hand(problem, steps):
     assert_no_gradient_for_critics(loss, batch)
 
 
+@pytest.mark.usefixtures("float64")
+def test_ppo_by_hand():
+    """min(rho A, clip(rho) A) row by row with torch's own Gaussian; rows on both sides of both clips."""
+    problem = FullNoise(3, 2, 2)
+    loss, batch = ppo_loss(problem), make_batch(problem, 200)
+    replay = batch["replay"]
+    following = replay["next"]
+    torch.manual_seed(5)
+    replay["loc"] = (loss.act(replay["tau"], replay["state"]) + 0.3 * torch.randn(len(replay), 2)).detach()
+    replay["action"] = replay["loc"] + 0.4 * torch.randn(len(replay), 2)
+    actor, critics = v_networks(problem)
+    value = [sum(net(td["tau"], td["state"], td["state"]) for net in critics) / 2 for td in (replay, following)]
+    advantage = (following["reward"] + torch.where(following["terminated"], 0.0, value[1]) - value[0]).detach()
+    advantage = (advantage / advantage.std()).squeeze(-1)
+    centers = actor(replay["tau"], replay["state"]), replay["loc"]
+    new, old = (torch.distributions.Normal(center, 0.4).log_prob(replay["action"]).sum(-1) for center in centers)
+    rows, kinds = [], set()
+    for ratio, a in zip((new - old).exp(), advantage, strict=True):
+        clipped = min(max(ratio, torch.tensor(0.7)), torch.tensor(1.3))
+        rows.append(min(ratio * a, clipped * a))
+        kinds.add((bool(a > 0), 0 if clipped == ratio else 1 if ratio > 1 else -1))
+    assert len(kinds) == 6
+    expected = -torch.stack(rows).mean()
+    ours = loss.actor_loss(batch)[0]
+    assert_close([ours], [expected])
+    assert_close(gradients(ours, loss.actor_network_params), torch.autograd.grad(expected, list(actor.parameters())))
+    assert_no_gradient_for_critics(loss, batch)
+
+
+@pytest.mark.usefixtures("float64")
+def test_ppo_climbs_the_slope_of_the_return():
+    """Where the played policy is the actor itself, the gradient is that of E[A] in its output: a reward b . a of one
+    step gives b divided by A's deviation, |b| sigma. Four standard errors of 200,000 draws are 0.9 %."""
+    problem = FullNoise(3, 2, 2)
+    loss, sigma, count = ppo_loss(problem), 0.4, 200_000
+    torch.manual_seed(6)
+    tau, x = torch.full((count, 1), 0.5), problem.states.sample(1).double().expand(count, -1)
+    loc = loss.act(tau, x).detach()
+    played, slope = loc + sigma * torch.randn(count, 2), torch.tensor([0.6, -0.8])
+    ended = torch.ones(count, 1, dtype=torch.bool)
+    following = {"tau": tau, "state": x, "reward": (played @ slope).unsqueeze(-1), "terminated": ended}
+    batch = {"replay": {"tau": tau, "state": x, "loc": loc, "action": played, "next": following}}
+    ours = gradients(loss.actor_loss(TensorDict(batch))[0], loss.actor_network_params)
+    actor, _ = v_networks(problem)
+    along = -(actor(tau[:1], x[:1]) @ (slope / sigma)).sum()
+    by_hand = torch.autograd.grad(along, list(actor.parameters()))
+    error = sum((a - b).square().sum() for a, b in zip(ours, by_hand, strict=True)).sqrt()
+    assert error <= 0.009 * sum(b.square().sum() for b in by_hand).sqrt()
+
+
+def ppo_loss(problem) -> PIRLLoss:
+    return PIRLLoss(problem, *v_networks(problem), actor_rule="ppo", exploration_noise=0.4, ppo_clip=0.3)
+
+
+def test_ppo_without_returns_is_refused():
+    problem = Reach1D()
+    with pytest.raises(ValueError, match="expected a weight of the TD loss above 0"):
+        ppo_loss(problem).actor_loss(TensorDict({"replay": make_batch(problem)["replay"].exclude("next")}))
+
+
 def assert_no_gradient_for_critics(loss, batch):
     loss.zero_grad()
     loss.actor_loss(batch)[0].backward()
@@ -372,7 +432,7 @@ def test_look_ahead_follows_the_hamiltonian_as_the_step_shrinks():
         return torch.cat([entry.flatten() / dt for entry in gradients(value, loss.actor_network_params)])
 
     loss = PIRLLoss(problem, *v_networks(problem), actor_rule="hamiltonian")
-    loss._hamiltonian_operator = advection
+    loss.hamiltonian_operator = advection
     limit = loss.actor_loss(TensorDict({"replay": kept}))[0]
     exact = torch.cat([entry.flatten() for entry in gradients(limit, loss.actor_network_params)])
     errors = [((slope(dt) - exact).norm() / exact.norm()).item() for dt in (1e-2, 1e-3)]
@@ -422,6 +482,7 @@ def test_cross_entropy_and_mean_target_by_hand(problem):
         ({"td_criterion": "cross_entropy"}, "needs critics with output 'Sigmoid'"),
         ({"target_critics": "max"}, "target_critics: expected 'min' or 'mean', got 'max'"),
         ({"actor_rule": "model"}, "loss.simulator: expected a simulator"),
+        ({"actor_rule": "ppo"}, "loss.actor_rule: 'ppo' takes advantages over V"),
         ({"model_steps": 0}, "model_steps: expected at least 1, got 0"),
     ],
 )
@@ -430,9 +491,14 @@ def test_wrong_arguments_are_named(kwargs, message):
         make_loss(Reach1D(), **kwargs)
 
 
+def test_ppo_without_noise_is_refused():
+    with pytest.raises(ValueError, match=r"collector.exploration_noise: expected noise > 0 .* got 0\.0"):
+        PIRLLoss(Reach1D(), *v_networks(Reach1D()), actor_rule="ppo")
+
+
 def test_an_unknown_rule_is_named():
-    with pytest.raises(ValueError, match=r"actor_rule: expected 'q', 'hamiltonian', 'both' or 'model', got 'ppo'"):
-        make_loss(Reach1D(), actor_rule="ppo")
+    with pytest.raises(ValueError, match="actor_rule: expected one of q, hamiltonian, both, model, ppo, got 'sac'"):
+        make_loss(Reach1D(), actor_rule="sac")
 
 
 def test_a_relu_critic_is_refused_by_name():

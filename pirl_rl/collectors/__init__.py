@@ -36,8 +36,16 @@ class TransitionCollector(Protocol):
         """Length of returns."""
         ...
 
-    def play(self, initial_states: InitialStates, n_steps: int) -> None:
-        """Go on with another law of starts and other returns, as a stage of a curriculum asks."""
+    @property
+    def exploration_noise(self) -> float:
+        """Deviation of the noise on played actions."""
+        ...
+
+    def play(self, initial_states: InitialStates, n_steps: int, exploration_noise: float) -> None:
+        """Go on with other starts, returns and noise, as a stage of a curriculum asks.
+
+        What was played with other noise leaves the buffer: it is another policy's.
+        """
 
     def begin(self, buffer: dict[str, Any] | None) -> None:
         """Begin a run with a trained actor: with the transitions of another collector's `buffer` state, if any, and a

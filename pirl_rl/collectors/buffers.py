@@ -64,8 +64,11 @@ def fill_buffer(
     if not state["transitions"]:
         return
     transitions = TensorDict(state["transitions"]).auto_batch_size_(1)
-    example = env.fake_tensordict().select(*TRANSITION)
+    example = env.fake_tensordict()
+    example = example.set("loc", example["action"]).select(*TRANSITION)
     for key in TRANSITION:
+        if key not in transitions.keys(True):
+            raise ValueError(f"replay buffer: expected {key}, got none; take a file of checkpoints/weights-* instead")
         got, expected = (entry.get(key).shape[1:] for entry in (transitions, example))
         if got != expected:
             raise ValueError(f"replay buffer, {key}: expected shape {tuple(expected)}, got {tuple(got)}")

@@ -77,13 +77,21 @@ class MultiAsyncCollector:
     def n_steps(self) -> int:
         return self._transitions.n_steps
 
-    def play(self, initial_states: InitialStates, n_steps: int) -> None:
+    @property
+    def exploration_noise(self) -> float:
+        return self._exploration.deviation
+
+    def play(self, initial_states: InitialStates, n_steps: int, exploration_noise: float) -> None:
         """Where something changes, the workers start anew."""
-        if initial_states is self.initial_states and n_steps == self.n_steps:
+        noisier = exploration_noise != self.exploration_noise
+        if initial_states is self.initial_states and n_steps == self.n_steps and not noisier:
             return
+        self.close()
         self._env.initial_states, self._transitions = initial_states, Transitions(n_steps)
+        if noisier:
+            self._exploration.deviation = exploration_noise
+            self.buffer.empty(empty_write_count=False)
         if self._collector is not None:
-            self.close()
             self.start()
 
     def begin(self, buffer: dict[str, Any] | None) -> None:
@@ -119,7 +127,7 @@ class MultiAsyncCollector:
         self._collector.set_seed(self._seed)
         self._collector.start()
         self._delivered_at = time.monotonic()
-        while self.buffer.write_count < self.warmup_frames:
+        while len(self.buffer) < min(self.warmup_frames, self.buffer.storage.max_size):
             self._check_workers()
             time.sleep(0.02)
 
@@ -134,10 +142,11 @@ class MultiAsyncCollector:
             self._collector.async_shutdown()
 
     def state_dict(self) -> dict[str, Any]:
-        return {"buffer": buffer_state(self.buffer, self._rng)}
+        return {"buffer": buffer_state(self.buffer, self._rng), "exploration_noise": self.exploration_noise}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         load_buffer(self.buffer, self._rng, state["buffer"])
+        self._exploration.deviation = state["exploration_noise"]
 
     def _check_workers(self) -> None:
         """TorchRL is silent about dead workers, and may wait for ever for their answer."""

@@ -47,9 +47,10 @@ class SyncCollector:
         check_sizes(env, frames_per_batch, updates_per_batch, warmup_frames, buffer_size)
         self.env, self.updates_per_batch, self.warmup_frames = env, updates_per_batch, warmup_frames
         self.buffer, self._rng = make_buffer(buffer_size, env.device, seed)
+        self._exploration = Exploration(exploration_noise, exploration)
         self._collector = Collector(
             env,
-            exploring_policy(actor, Exploration(exploration_noise, exploration)),
+            exploring_policy(actor, self._exploration),
             frames_per_batch=frames_per_batch,
             total_frames=-1,
             init_random_frames=-(-warmup_frames // frames_per_batch) * frames_per_batch,
@@ -67,8 +68,15 @@ class SyncCollector:
     def n_steps(self) -> int:
         return self._transitions.n_steps
 
-    def play(self, initial_states: InitialStates, n_steps: int) -> None:
+    @property
+    def exploration_noise(self) -> float:
+        return self._exploration.deviation
+
+    def play(self, initial_states: InitialStates, n_steps: int, exploration_noise: float) -> None:
         self.env.initial_states, self._transitions = initial_states, Transitions(n_steps)
+        if exploration_noise != self.exploration_noise:
+            self._exploration.deviation = exploration_noise
+            self.buffer.empty()
 
     def begin(self, buffer: dict[str, Any] | None) -> None:
         if buffer is not None:
@@ -83,6 +91,7 @@ class SyncCollector:
     def step(self, update: int) -> None:
         if update % self.updates_per_batch == 0:
             self._collect()
+        self.start()  # a stage may have emptied the buffer
 
     def close(self) -> None:
         self._collector.shutdown()
@@ -90,6 +99,7 @@ class SyncCollector:
     def state_dict(self) -> dict[str, Any]:
         return {
             "buffer": buffer_state(self.buffer, self._rng),
+            "exploration_noise": self.exploration_noise,
             "frames": self._collector.state_dict()["frames"],
             "carrier": self._collector._carrier.to_dict(),
             "env_rng": self.env.rng.get_state(),
@@ -97,6 +107,7 @@ class SyncCollector:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         load_buffer(self.buffer, self._rng, state["buffer"])
+        self._exploration.deviation = state["exploration_noise"]
         # TorchRL saves no environment state; the carried TensorDict is all that a ReachAvoidEnv has.
         self._load_frames(state["frames"])
         self._collector._carrier.update(TensorDict(state["carrier"], device=self.env.device))
@@ -106,4 +117,7 @@ class SyncCollector:
         self._collector.load_state_dict({**self._collector.state_dict(), "frames": frames})  # type: ignore[arg-type]
 
     def _collect(self) -> None:
-        self.buffer.extend(self._transitions(next(self._batches)))
+        # TorchRL leaves what the policy wrote before beside a warm-up's random actions.
+        random = self._collector._should_use_random_frames()
+        batch = next(self._batches)
+        self.buffer.extend(self._transitions(batch.exclude("loc") if random else batch))

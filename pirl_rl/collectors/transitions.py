@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from pirl_rl.networks import Actor
 
-TRANSITION = ("tau", "state", "action", *(("next", key) for key in ("tau", "state", "reward", "terminated")))
-"""What the loss reads of a transition."""
+TRANSITION = ("tau", "state", "action", "loc", *(("next", key) for key in ("tau", "state", "reward", "terminated")))
+"""What the loss reads of a transition; "loc" is the actor's output, "action" what was played."""
 
 
 class Exploration(nn.Module):
@@ -30,16 +30,16 @@ class Exploration(nn.Module):
             raise ValueError(f"collector: expected noise >= 0, always or at start; got {deviation!r} and {when!r}")
         self.deviation, self.when = deviation, when
 
-    def forward(self, action: Tensor, is_init: Tensor) -> Tensor:
-        noise = self.deviation * torch.randn_like(action)
-        return (action + (noise if self.when == "always" else noise * is_init)).clamp(-1, 1)
+    def forward(self, loc: Tensor, is_init: Tensor) -> Tensor:
+        noise = self.deviation * torch.randn_like(loc)
+        return (loc + (noise if self.when == "always" else noise * is_init)).clamp(-1, 1)
 
 
 def exploring_policy(actor: Actor, exploration: Exploration) -> TensorDictSequential:
     """The actor with noise."""
     return TensorDictSequential(
-        TensorDictModule(actor, in_keys=["tau", "state"], out_keys=["action"]),  # type: ignore[arg-type]
-        TensorDictModule(exploration, in_keys=["action", "is_init"], out_keys=["action"]),  # type: ignore[arg-type]
+        TensorDictModule(actor, in_keys=["tau", "state"], out_keys=["loc"]),  # type: ignore[arg-type]
+        TensorDictModule(exploration, in_keys=["loc", "is_init"], out_keys=["action"]),  # type: ignore[arg-type]
     )
 
 
@@ -55,6 +55,9 @@ class Transitions:
         self.n_steps = n_steps
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
+        if "loc" not in batch.keys():
+            # Random actions of a warm-up have no policy behind them.
+            batch = batch.set("loc", batch["action"])
         batch = batch.select(*TRANSITION)
         following: TensorDictBase = batch.get("next")
         reward, ended = following["reward"], following["terminated"]
