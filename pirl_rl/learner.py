@@ -70,6 +70,9 @@ class Learner:
         """Go on as a stage of a curriculum asks."""
         self.actor_every, self.train_actor = settings.actor_every, settings.train_actor
         self.learning_rate = settings.learning_rate
+        if settings.actor_rule != self.loss.actor_rule:
+            # Adam's moments of one objective are the wrong scale for another's first steps.
+            self.actor_optimizer.state.clear()
         self.loss.actor_rule, self.loss.model_steps = settings.actor_rule, settings.model_steps
         self.loss.exploration_noise = settings.exploration_noise
 
@@ -122,13 +125,14 @@ class Learner:
         return {
             "loss": self.loss.state_dict(),
             "loss_actor": self._loss_actor,
+            "actor_rule": self.loss.actor_rule,
             "critic_optimizer": self.critic_optimizer.state_dict(),
             "actor_optimizer": self.actor_optimizer.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.loss.load_state_dict(state["loss"])
-        self._loss_actor = state["loss_actor"]
+        self._loss_actor, self.loss.actor_rule = state["loss_actor"], state["actor_rule"]
         self.critic_optimizer.load_state_dict(state["critic_optimizer"])
         self.actor_optimizer.load_state_dict(state["actor_optimizer"])
 

@@ -122,6 +122,18 @@ def test_a_stage_of_policy_gradients_follows_its_own_noise_alone(collector, tmp_
     assert all(0.1 < off < 0.6 for *_, off in seen[9:])
 
 
+def test_a_new_rule_starts_with_fresh_moments(tmp_path):
+    trainer, steps = small_trainer(tmp_path, *POLICY, "learner.actor_every=1"), {}
+    for update in (3, 5, 9, 11):
+        at_update(trainer, update, lambda u=update: steps.update({u: _steps(trainer.learner.actor_optimizer)}))
+    trainer.train()
+    assert steps == {3: {2.0}, 5: {1.0}, 9: {5.0}, 11: {1.0}}
+
+
+def _steps(optimizer: torch.optim.Optimizer) -> set[float]:
+    return {state["step"].item() for state in optimizer.state.values()}
+
+
 def test_resume_between_noises_is_exact(tmp_path):
     small_trainer(tmp_path / "whole", *POLICY).train()
     stopped = small_trainer(tmp_path / "cut", *POLICY)
