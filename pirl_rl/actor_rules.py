@@ -73,7 +73,7 @@ def ppo(loss: PIRLLoss, replay: TensorDictBase, points: TensorDictBase) -> Tenso
     rho is the ratio of the densities of the played action under pi and under the policy that played it, Gaussians of
     deviation `exploration_noise` around the actor's output, their cut at -1 and 1 neglected; A = r + (1 - d) V(y') -
     V(y), in units of its deviation over the batch. Unlike the other rules it sees the advantage of what was really
-    played, noise, exits and all, and not a slope of V.
+    played, noise, exits and all, and not a slope of V. It wants noise on every action, `collector.exploration=always`.
     """
     tau, x, played = replay["tau"], replay["state"], replay["action"]
     following: TensorDictBase | None = replay.get("next", None)
