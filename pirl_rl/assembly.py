@@ -174,4 +174,6 @@ def fitting(path: Path) -> Iterator[None]:
         raise
     except (RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
         reason = " ".join(str(error).split())[:300]
+        if isinstance(error, KeyError):
+            reason = f"no entry {reason}; a file of checkpoints/weights-* holds networks alone and may still do"
         raise CheckpointError(f"{path} does not fit the run's configuration: {reason}") from error

@@ -82,23 +82,24 @@ def test_the_trainer_takes_over_what_a_stage_sets(tmp_path):
     assert seen == [((0.0,), size, 1, 2, 1)] * 5 + [(None, 7, 3, 5, 4)] * 5
 
 
-def test_resume_inside_a_stage_is_exact(tmp_path):
-    small_trainer(tmp_path / "whole", *STAGES).train()
-    stopped = small_trainer(tmp_path / "cut", *STAGES)
-    at_update(stopped, 7, interrupt)
-    with pytest.raises(Interrupted):
-        stopped.train()
-    resumed(tmp_path / "cut", *STAGES).train()
-    ends = [checkpoint.load(tmp_path / name / checkpoint.FOLDER / checkpoint.LAST) for name in ("whole", "cut")]
-    assert ends[0]["update"] == 10
-    assert_same(*ends)
-
-
 POLICY = (
     "stages=[{updates: 1, n_steps: 4}, {updates: 2, actor_rule: ppo, exploration_noise: 0.3}, "
     "{updates: 1, exploration_noise: 0.1}]",
     "trainer.updates=12",
 )
+
+
+@pytest.mark.parametrize(("stages", "stop", "end"), [(STAGES, 7, 10), (POLICY, 6, 12)], ids=["starts", "noise"])
+def test_resume_inside_a_stage_is_exact(stages, stop, end, tmp_path):
+    small_trainer(tmp_path / "whole", *stages).train()
+    stopped = small_trainer(tmp_path / "cut", *stages)
+    at_update(stopped, stop, interrupt)
+    with pytest.raises(Interrupted):
+        stopped.train()
+    resumed(tmp_path / "cut", *stages).train()
+    ends = [checkpoint.load(tmp_path / name / checkpoint.FOLDER / checkpoint.LAST) for name in ("whole", "cut")]
+    assert ends[0]["update"] == end
+    assert_same(*ends)
 
 
 @pytest.mark.parametrize("collector", ["sync", "multi_async"])
@@ -132,16 +133,6 @@ def test_a_new_rule_starts_with_fresh_moments(tmp_path):
 
 def _steps(optimizer: torch.optim.Optimizer) -> set[float]:
     return {state["step"].item() for state in optimizer.state.values()}
-
-
-def test_resume_between_noises_is_exact(tmp_path):
-    small_trainer(tmp_path / "whole", *POLICY).train()
-    stopped = small_trainer(tmp_path / "cut", *POLICY)
-    at_update(stopped, 6, interrupt)
-    with pytest.raises(Interrupted):
-        stopped.train()
-    resumed(tmp_path / "cut", *POLICY).train()
-    assert_same(*[checkpoint.load(tmp_path / name / checkpoint.FOLDER / checkpoint.LAST) for name in ("whole", "cut")])
 
 
 @pytest.mark.parametrize(

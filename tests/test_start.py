@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
 from small import QUICK, assert_same, at_update, interrupt, resumed, small_trainer
@@ -172,6 +174,16 @@ def test_transitions_of_another_environment_are_refused(first, tmp_path):
 @pytest.fixture
 def cli(in_process):
     return in_process(train)
+
+
+@pytest.mark.parametrize(("part", "key"), [("learner", "actor_rule"), ("transitions", "loc")])
+def test_a_checkpoint_that_lacks_an_entry_says_which(part, key, first, tmp_path):
+    _folder, left = first
+    state = copy.deepcopy(left)
+    del (state["learner"] if part == "learner" else state["collector"]["buffer"]["transitions"])[key]
+    checkpoint.save(state, path := tmp_path / "older" / LAST)
+    with pytest.raises(CheckpointError, match=f"does not fit.*no entry .*{key}.*weights-"):
+        begun(tmp_path / "new", path)
 
 
 def test_the_command_starts_from_a_run(first, cli, tmp_path):

@@ -67,9 +67,7 @@ def fill_buffer(
     example = env.fake_tensordict()
     example = example.set("loc", example["action"]).select(*TRANSITION)
     for key in TRANSITION:
-        if key not in transitions.keys(True):
-            raise ValueError(f"replay buffer: expected {key}, got none; take a file of checkpoints/weights-* instead")
-        got, expected = (entry.get(key).shape[1:] for entry in (transitions, example))
+        got, expected = (entry[key].shape[1:] for entry in (transitions, example))
         if got != expected:
             raise ValueError(f"replay buffer, {key}: expected shape {tuple(expected)}, got {tuple(got)}")
     count, size = len(transitions), buffer.storage.max_size

@@ -83,12 +83,12 @@ class MultiAsyncCollector:
 
     def play(self, initial_states: InitialStates, n_steps: int, exploration_noise: float) -> None:
         """Where something changes, the workers start anew."""
-        noisier = exploration_noise != self.exploration_noise
-        if initial_states is self.initial_states and n_steps == self.n_steps and not noisier:
+        other_noise = exploration_noise != self.exploration_noise
+        if initial_states is self.initial_states and n_steps == self.n_steps and not other_noise:
             return
         self.close()
         self._env.initial_states, self._transitions = initial_states, Transitions(n_steps)
-        if noisier:
+        if other_noise:
             self._exploration.deviation = exploration_noise
             self.buffer.empty(empty_write_count=False)
         if self._collector is not None:
