@@ -26,14 +26,14 @@ import torch
 from torch import Tensor, nn
 
 from pirl_rl import load_run
-from pirl_rl.evaluation import Accuracy, DriftStates, Rollouts, Slices
+from pirl_rl.evaluation import Accuracy, Rollouts, Slices
 from pirl_rl.evaluation.accuracy import SIMULATORS
-from pirl_rl.evaluation.drift_states import NETWORK_BOX
 from pirl_rl.evaluation.monte_carlo import Policy, mean_payoff
 from pirl_rl.evaluation.reference_states import displaced, visited_by
-from pirl_rl.initial_states import EquilibriumStates
-from pirl_rl.plots import save_figures
+from pirl_rl.figures.run import save_figures
 from pirl_rl.problems import VehicleDrift
+from pirl_rl.problems.drift.reference_states import NETWORK_BOX, DriftStates
+from pirl_rl.problems.drift.starts import EquilibriumStates
 from pirl_rl.simulator import Simulator
 
 COLUMNS = {
@@ -127,16 +127,16 @@ class Regression(Solved):
 
 def outcomes(problem: VehicleDrift, policy: Policy, count: int) -> tuple[Tensor, Tensor]:
     """Network inputs (N, 8) and single payoffs (N,) of about `count` paths, a tenth from each plane at tau = T."""
-    generator = torch.Generator().manual_seed(SEED)
-    visited = visited_by(Simulator(problem, **SIMULATORS["paper"]), policy, EquilibriumStates(), 8_192, generator)
-    states = [displaced(problem, *visited, NETWORK_BOX, generator, count, 0.40)]
+    rng = torch.Generator().manual_seed(SEED)
+    visited = visited_by(Simulator(problem, **SIMULATORS["paper"]), policy, EquilibriumStates(), 8_192, rng)
+    states = [displaced(problem, *visited, NETWORK_BOX, rng, count, 0.40)]
     for plane in problem.planes.values():
-        x = plane.embed(plane.box.sample(count // 10, generator))
+        x = plane.embed(plane.box.sample(count // 10, rng))
         states.append((torch.full((len(x),), problem.horizon), x))
     tau, x = (torch.cat(parts) for parts in zip(*states, strict=True))
     kept = problem.interior(x) & ~problem.unreachable(x)
     tau, x = tau[kept], x[kept]
-    payoff = mean_payoff(Simulator(problem, **SIMULATORS["fine"]), policy, tau, x, 1, generator)
+    payoff = mean_payoff(Simulator(problem, **SIMULATORS["fine"]), policy, tau, x, 1, rng)
     return network_inputs(tau, x), payoff.float()
 
 

@@ -1,9 +1,9 @@
-"""The committed reference states of the drifting problem, `pirl_rl/evaluation/drift_states.npz`.
+"""The committed reference states of the drifting problem, `pirl_rl/problems/drift/reference_states.npz`.
 
     python benchmarks/drift_states.py WEIGHTS/refnet_td3rand_10M.npz [--out FILE]
 
-The recipe, `pirl_rl.evaluation.drift_states`, is the paper's protocol for its table of accuracy with a seed of our
-own. 1,024 episodes of the paper's TD3 policy of random horizon, without policy noise, start from the paper's full-
+The recipe, `pirl_rl.problems.drift.reference_states`, is the paper's protocol for its table of accuracy with a seed of
+our own. 1,024 episodes of the paper's TD3 policy of random horizon, without policy noise, start from the paper's full-
 scale law (friction uniform in [0.5, 0.6]; 30% displaced in the beta-r plane, 30% in the e_y-e_psi plane, 40% in both)
 with 1 to 50 steps to go, and are played by the paper's simulator (Euler steps of 0.1 s, exits at end points). Of the
 states before each step 512 are moved in a random direction of the paper's network coordinates (tau and all seven
@@ -20,7 +20,7 @@ from pathlib import Path
 import torch
 from drift_baselines import Baseline
 
-from pirl_rl.evaluation.drift_states import FILE, drift_states
+from pirl_rl.problems.drift.reference_states import FILE, drift_states
 
 
 def main() -> None:

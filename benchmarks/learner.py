@@ -21,11 +21,12 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from pirl_rl.collocation import BoundarySampler, Collocation
 from pirl_rl.losses import PIRLLoss
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems import Reach1D
+from pirl_rl.sampling.boundary import BoundarySampler
+from pirl_rl.sampling.collocation import Collocation
 from pirl_rl.sets import Box
 
 POLYAK = 0.005
@@ -49,7 +50,7 @@ class SevenStates(ReachAvoidProblem):
 
 
 class NestedLoss(PIRLLoss):
-    """The same loss with the generator by nested autograd."""
+    """The same loss with the rng by nested autograd."""
 
     def residuals(self, tau: Tensor, x: Tensor, action: Tensor, u: Tensor) -> Tensor:
         f, sigma = self.problem.drift(x, u), self.problem.diffusion(x, u)
@@ -83,14 +84,14 @@ SHAPES = (
 
 
 def make_batch(shape: Shape) -> TensorDict:
-    problem, generator = shape.problem, torch.Generator().manual_seed(0)
-    collocation = Collocation(problem, shape.collocation).sample(generator)
-    boundary = BoundarySampler(problem, shape.boundary // 2, shape.boundary // 2).sample(generator)
+    problem, rng = shape.problem, torch.Generator().manual_seed(0)
+    collocation = Collocation(problem, shape.collocation).sample(rng)
+    boundary = BoundarySampler(problem, shape.boundary // 2, shape.boundary // 2).sample(rng)
     points = Collocation(problem, shape.transitions)
-    replay, following = points.sample(generator).exclude("mask"), points.sample(generator).exclude("mask")
-    replay["action"] = 2 * torch.rand(shape.transitions, problem.controls.dim, generator=generator) - 1
-    following["reward"] = torch.rand(shape.transitions, 1, generator=generator)
-    following["terminated"] = following["done"] = torch.rand(shape.transitions, 1, generator=generator) < 0.1
+    replay, following = points.sample(rng).exclude("mask"), points.sample(rng).exclude("mask")
+    replay["action"] = 2 * torch.rand(shape.transitions, problem.controls.dim, generator=rng) - 1
+    following["reward"] = torch.rand(shape.transitions, 1, generator=rng)
+    following["terminated"] = following["done"] = torch.rand(shape.transitions, 1, generator=rng) < 0.1
     replay["next"] = following
     return TensorDict({"replay": replay, "collocation": collocation, "boundary": boundary})
 

@@ -20,7 +20,9 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 
-from pirl_rl.envs import DriftEnv, Reach1DEnv, ReachAvoidEnv
+from pirl_rl.envs import ReachAvoidEnv
+from pirl_rl.problems.drift.env import DriftEnv
+from pirl_rl.problems.reach1d_env import Reach1DEnv
 
 
 def push(tau: torch.Tensor) -> torch.Tensor:

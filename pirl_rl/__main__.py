@@ -1,57 +1,6 @@
-"""`python -m pirl_rl`: what there is to train, and how."""
+"""`python -m pirl_rl`: see `pirl_rl.commands.catalogue`."""
 
-from __future__ import annotations
-
-import inspect
-from pathlib import Path
-
-from pirl_rl import problems
-from pirl_rl.configuration import CONF
-
-COMMANDS = (
-    ("python -m pirl_rl.train +experiment=reach1d", "train; any setting follows as key=value, -m sweeps over several"),
-    ("python -m pirl_rl.train +experiment=own env.problem._target_=my_module.MyProblem", "train on your own problem"),
-    ("python -m pirl_rl.train resume=RUN_DIR", "go on with a run"),
-    ("python -m pirl_rl.train +experiment=reach1d start=RUN_DIR", "begin from another run's networks"),
-    ("python -m pirl_rl.train +experiment=reach1d --cfg job", "show all settings"),
-    ("python -m pirl_rl.evaluate run=RUN_DIR", "evaluate a run again, with other samples or simulators if asked"),
-    ("python -m pirl_rl.tune +experiment=drift start=RUN_DIR", "go on from a run in rounds that an advisor plans"),
-    ("python -m pirl_rl.compare RUN_DIRS", "one table and one figure of many runs"),
-    ("python -m pirl_rl.sweeps DIR", "a table and a heat map of a sweep"),
-)
-GROUPS = {
-    "experiment": "experiments, +experiment=NAME",
-    "method": "methods, method=NAME",
-    "collector": "collectors, collector=NAME",
-    "logger": "loggers, logger=NAME",
-    "advisor": "advisors of the outer loop, advisor=NAME",
-}
-
-
-def catalogue() -> str:
-    """Problems, choices and commands, one line each."""
-    known = [getattr(problems, name) for name in problems.__all__]
-    parts = [_table("problems", [(problem.__name__, _first_line(problem)) for problem in known])]
-    for group, title in GROUPS.items():
-        rows = [(path.stem, _comment(path)) for path in sorted((CONF / group).glob("*.yaml"))]
-        parts.append(_table(title, rows))
-    commands = "\n".join(f"  {command}\n      {meaning}" for command, meaning in COMMANDS)
-    return "\n\n".join([*parts, f"commands\n{commands}"])
-
-
-def _table(title: str, rows: list[tuple[str, str]]) -> str:
-    return "\n".join([title, *(f"  {name:<16} {meaning}".rstrip() for name, meaning in rows)])
-
-
-def _first_line(cls: type) -> str:
-    return (inspect.getdoc(cls) or "").partition("\n")[0]
-
-
-def _comment(path: Path) -> str:
-    """The first comment of a YAML file that is no directive of Hydra's."""
-    lines = path.read_text(encoding="utf-8").splitlines()
-    return next((line[2:] for line in lines if line.startswith("# ") and "@package" not in line), "")
-
+from pirl_rl.commands.catalogue import catalogue
 
 if __name__ == "__main__":
     print(catalogue())

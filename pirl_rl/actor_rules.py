@@ -14,6 +14,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from pirl_rl.errors import ArgumentError
 from pirl_rl.networks import Critic
 from pirl_rl.operators import masked_mean
 from pirl_rl.simulator import Simulator
@@ -78,7 +79,7 @@ def ppo(loss: PIRLLoss, replay: TensorDictBase, points: TensorDictBase) -> Tenso
     tau, x, played = replay["tau"], replay["state"], replay["action"]
     following: TensorDictBase | None = replay.get("next", None)
     if following is None:
-        raise ValueError("loss.actor_rule: 'ppo' follows returns, expected a weight of the TD loss above 0")
+        raise ArgumentError("loss.actor_rule: 'ppo' follows returns, expected a weight of the TD loss above 0")
     with torch.no_grad(), loss.critics("frozen") as critic:
         here, there = (
             critic(t, y, loss.act(t, y)).mean(0) for t, y in ((tau, x), (following["tau"], following["state"]))
@@ -107,16 +108,18 @@ def check_rule(rule: ActorRule, critic: Critic, simulator: Simulator | None, exp
         ValueError: naming it.
     """
     if rule not in ACTOR_RULES:
-        raise ValueError(f"loss.actor_rule: expected one of {', '.join(ACTOR_RULES)}, got {rule!r}")
+        raise ArgumentError(f"loss.actor_rule: expected one of {', '.join(ACTOR_RULES)}, got {rule!r}")
     if rule in ("q", "both") and not critic.action_input:
-        raise ValueError(
+        raise ArgumentError(
             f"loss.actor_rule: critics without the action need 'hamiltonian', 'model' or 'ppo', got {rule!r}"
         )
     if rule == "ppo" and critic.action_input:
-        raise ValueError("loss.actor_rule: 'ppo' takes advantages over V(tau, x), expected critics without the action")
+        raise ArgumentError(
+            "loss.actor_rule: 'ppo' takes advantages over V(tau, x), expected critics without the action"
+        )
     if rule == "model" and simulator is None:
-        raise ValueError("loss.simulator: expected a simulator for actor_rule 'model', got none")
+        raise ArgumentError("loss.simulator: expected a simulator for actor_rule 'model', got none")
     if rule == "ppo" and not exploration_noise > 0:
-        raise ValueError(
+        raise ArgumentError(
             f"collector.exploration_noise: expected noise > 0 for actor_rule 'ppo', got {exploration_noise}"
         )

@@ -13,10 +13,10 @@ import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from pirl_rl import checkpoint
-from pirl_rl.checkpoint import CheckpointError
-from pirl_rl.configuration import ConfigError, build, convert
+from pirl_rl.configuration import build, convert
 from pirl_rl.curriculum import Curriculum, Stage
 from pirl_rl.envs import ReachAvoidEnv
+from pirl_rl.errors import CheckpointError, ConfigError
 from pirl_rl.evaluation import Evaluator
 from pirl_rl.losses import PIRLLoss
 from pirl_rl.problem import ReachAvoidProblem

@@ -12,16 +12,13 @@ from typing import Any
 
 import torch
 
+from pirl_rl.errors import CheckpointError
 from pirl_rl.files import replacing
 
 FOLDER = "checkpoints"
 LAST = "last.pt"
 TARGET = "target_"
 """Begins the names of the target networks' parameters, which may be missing where nothing is trained further."""
-
-
-class CheckpointError(RuntimeError):
-    """A checkpoint that is missing, broken or not one of ours; the message names the file."""
 
 
 def save(state: dict[str, Any], path: Path) -> None:
@@ -59,12 +56,15 @@ def loss_state(state: dict[str, Any]) -> dict[str, Any]:
     return {f"{TARGET}{name}": entry for name, entry in own.items()} | loss
 
 
-def restore_rng(generator: torch.Generator, state: torch.Tensor) -> None:
-    """Put a generator where it was; one of another kind of device has other states, and begins from a seed of this."""
-    if len(state) == len(generator.get_state()):
-        generator.set_state(state)
+def restore_rng(rng: torch.Generator, state: torch.Tensor) -> None:
+    """Put a random generator back where it was.
+
+    A generator of another kind of device has other states: there it is seeded from the saved state.
+    """
+    if len(state) == len(rng.get_state()):
+        rng.set_state(state)
     else:
-        generator.manual_seed(zlib.crc32(state.numpy().tobytes()))
+        rng.manual_seed(zlib.crc32(state.numpy().tobytes()))
 
 
 def newest(run: Path) -> Path:

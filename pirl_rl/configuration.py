@@ -20,6 +20,7 @@ import yaml
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from pirl_rl.errors import ConfigError
 from pirl_rl.files import replacing
 
 PACKAGE = Path(__file__).resolve().parent
@@ -31,10 +32,6 @@ CONFIG = Path(".hydra") / "config.yaml"
 
 REFERENCE = re.compile(r"\$\{[\w.]+\}")
 CHECKED = (bool, int, float, str, type(None))
-
-
-class ConfigError(ValueError):
-    """A configuration that cannot be built; the message names the key, what was expected and what was got."""
 
 
 def build(node: Any, key: str, trust: Sequence[str] = (), **extra: Any) -> Any:

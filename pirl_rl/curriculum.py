@@ -9,8 +9,9 @@ from dataclasses import dataclass, fields, replace
 from itertools import accumulate
 
 from pirl_rl.actor_rules import ActorRule
-from pirl_rl.collocation import Collocation
-from pirl_rl.initial_states import InitialStates
+from pirl_rl.errors import ArgumentError
+from pirl_rl.sampling.collocation import Collocation
+from pirl_rl.sampling.initial_states import InitialStates
 from pirl_rl.schedules import Schedule, Weights
 
 
@@ -61,15 +62,15 @@ class Stage:
 
     def __post_init__(self):
         if not self.updates > 0:
-            raise ValueError(f"stage.updates: expected a number > 0, got {self.updates}")
+            raise ArgumentError(f"stage.updates: expected a number > 0, got {self.updates}")
         for name in ("n_steps", "actor_every", "model_steps"):
             value = getattr(self, name)
             if value is not None and value < 1:
-                raise ValueError(f"stage.{name}: expected at least 1, got {value}")
+                raise ArgumentError(f"stage.{name}: expected at least 1, got {value}")
         if self.exploration_noise is not None and not self.exploration_noise >= 0:
-            raise ValueError(f"stage.exploration_noise: expected a number >= 0, got {self.exploration_noise}")
+            raise ArgumentError(f"stage.exploration_noise: expected a number >= 0, got {self.exploration_noise}")
         if self.learning_rate is not None and not self.learning_rate > 0:
-            raise ValueError(f"stage.learning_rate: expected a number > 0, got {self.learning_rate}")
+            raise ArgumentError(f"stage.learning_rate: expected a number > 0, got {self.learning_rate}")
 
     def over(self, run: Settings) -> Settings:
         """This stage's settings, the run's where it has none."""
@@ -88,7 +89,7 @@ class Curriculum:
 
     def __init__(self, schedule: Schedule, updates: int, stages: Sequence[Stage] = (Stage(1.0),)):
         if not stages:
-            raise ValueError("curriculum.stages: expected at least one stage, got none")
+            raise ArgumentError("curriculum.stages: expected at least one stage, got none")
         self.schedule, self.stages, self._updates = schedule, tuple(stages), updates
         self._before = [0.0, *accumulate(stage.updates for stage in stages)]
         self._stretch = updates / self._before.pop()

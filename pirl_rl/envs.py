@@ -16,9 +16,9 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from pirl_rl.initial_states import InitialStates, UniformStates
+from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem, check_problem
-from pirl_rl.problems import Reach1D, VehicleDrift
+from pirl_rl.sampling.initial_states import InitialStates, UniformStates
 from pirl_rl.simulator import Simulator, exit_value
 
 
@@ -32,7 +32,7 @@ class ReachAvoidEnv(EnvBase):
         crossing: "bridge" or "endpoint", see `pirl_rl.simulator`.
         initial_states: the law of episodes' starts.
         num_envs: batch size.
-        seed: of the environment's own generator; drawn from torch's where None.
+        seed: of the environment's own random generator; drawn from torch's where None.
         device: of all tensors.
 
     Raises:
@@ -55,7 +55,7 @@ class ReachAvoidEnv(EnvBase):
     ):
         check_problem(problem)
         if not (isinstance(num_envs, int) and num_envs >= 1):
-            raise ValueError(f"num_envs: expected an integer >= 1, got {num_envs!r}")
+            raise ArgumentError(f"num_envs: expected an integer >= 1, got {num_envs!r}")
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.problem = problem
         self.simulator = Simulator(problem, dt, substeps, crossing)  # type: ignore[arg-type]
@@ -131,17 +131,3 @@ class ReachAvoidEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self.rng.manual_seed(seed)
-
-
-class Reach1DEnv(ReachAvoidEnv):
-    """The paper's one-dimensional benchmark; arguments as of `ReachAvoidEnv` but the problem."""
-
-    def __init__(self, **kwargs):
-        super().__init__(Reach1D(), **kwargs)
-
-
-class DriftEnv(ReachAvoidEnv):
-    """The paper's vehicle drifting, exits watched at the ends of sub-steps; other arguments as of `ReachAvoidEnv`."""
-
-    def __init__(self, crossing: str = "endpoint", **kwargs):
-        super().__init__(VehicleDrift(), crossing=crossing, **kwargs)

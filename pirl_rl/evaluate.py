@@ -1,53 +1,6 @@
-"""Evaluate: `python -m pirl_rl.evaluate run=RUN_DIR [evaluation.success.episodes=100000 ...]`.
+"""`python -m pirl_rl.evaluate`: see `pirl_rl.commands.evaluate`."""
 
-Runs a finished run's evaluators again, with other samples or simulators if asked, leaves `evaluation.json` in it and
-draws its figures.
-"""
-
-from __future__ import annotations
-
-import json
-import sys
-from collections.abc import Sequence
-from pathlib import Path
-
-from pirl_rl.assembly import make_evaluators
-from pirl_rl.configuration import ConfigError, load_config
-from pirl_rl.console import named_modules, override, table, told
-from pirl_rl.evaluation import evaluate
-from pirl_rl.files import replacing
-from pirl_rl.loggers import METRICS_FILE
-from pirl_rl.plots import FIGURES, draw_run
-from pirl_rl.runs import load_run, refuse_links
-
-RESULTS = "evaluation.json"
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    arguments = sys.argv[1:] if arguments is None else arguments
-    named = [item for item in arguments if item.startswith("run=")]
-    folder = Path(named[-1].partition("=")[2]) if named else Path()
-    with told(folder):
-        if not named:
-            raise ConfigError("run: expected run=RUN_DIR, the directory of a finished run")
-        overrides = [item for item in arguments if item not in named]
-        config = load_config(folder)
-        config.trust = []
-        for text in overrides:
-            override(config, text)
-        trust = [*config.trust, *named_modules(overrides)]
-        evaluators = make_evaluators(config.evaluation, "final", trust)
-        solution = load_run(folder, trust, device=config.device).solution
-        refuse_links(folder)
-        metrics = evaluate(solution, evaluators)
-        with replacing(folder / RESULTS) as file:
-            file.write(json.dumps(metrics, indent=2) + "\n")
-        figures = draw_run(solution, folder / METRICS_FILE, folder / FIGURES, evaluators)
-    print(table(metrics))
-    for figure in figures:
-        print(f"figure   {figure}")
-    print(f"written  {folder / RESULTS}")
-
+from pirl_rl.commands.evaluate import main
 
 if __name__ == "__main__":
     main()

@@ -7,8 +7,9 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from pirl_rl.errors import CollapseError
 from pirl_rl.evaluation import Success
-from pirl_rl.learner import DivergenceError, Learner
+from pirl_rl.learner import Learner
 from pirl_rl.solution import Solution
 
 RATES = ("success_rate", "reward")
@@ -20,10 +21,6 @@ LEAST_SPREAD = 0.2
 
 GOOD = 2.0
 """Deviations below the baseline within which an evaluation is as good: 19 of 20 that truly are fall into it."""
-
-
-class CollapseError(DivergenceError):
-    """An evaluation fell below the baseline by more than noise; the message names the metrics, before and after."""
 
 
 class Guard:

@@ -13,15 +13,12 @@ from torch._dynamo.exc import BackendCompilerFailed
 from torchrl.objectives import SoftUpdate
 
 from pirl_rl.curriculum import Settings
+from pirl_rl.errors import ArgumentError, DivergenceError
 from pirl_rl.losses import PIRLLoss
 from pirl_rl.schedules import Schedule
 
 EXPLOSION = 1e6
 """A critic loss above this is a divergence: probabilities err by at most 1, and residuals of interest are far below."""
-
-
-class DivergenceError(RuntimeError):
-    """A loss became NaN, infinite or exploded; the message names the update and the term."""
 
 
 class Learner:
@@ -48,9 +45,9 @@ class Learner:
         compile: bool = True,
     ):
         if decay not in ("cosine", "constant"):
-            raise ValueError(f"learner.decay: expected 'cosine' or 'constant', got {decay!r}")
+            raise ArgumentError(f"learner.decay: expected 'cosine' or 'constant', got {decay!r}")
         if not learning_rate > 0 or actor_every < 1 or not 0 < polyak <= 1:
-            raise ValueError(
+            raise ArgumentError(
                 "learner: expected learning_rate > 0, actor_every >= 1 and 0 < polyak <= 1, "
                 f"got {learning_rate}, {actor_every} and {polyak}"
             )

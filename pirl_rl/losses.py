@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torchrl.objectives import TD3Loss
 
 from pirl_rl.actor_rules import ACTOR_RULES, ActorRule, check_rule
+from pirl_rl.errors import ArgumentError
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.operators import advection, generator, masked_mean, require_twice_differentiable
 from pirl_rl.problem import ReachAvoidProblem, has_controlled_noise
@@ -96,13 +97,13 @@ class PIRLLoss(TD3Loss):
         for critic in critics:
             check_rule(actor_rule, critic, simulator, exploration_noise)
         if td_criterion not in TD_CRITERIA:
-            raise ValueError(f"loss.td_criterion: expected one of {', '.join(TD_CRITERIA)}, got {td_criterion!r}")
+            raise ArgumentError(f"loss.td_criterion: expected one of {', '.join(TD_CRITERIA)}, got {td_criterion!r}")
         if td_criterion == "cross_entropy" and not all(isinstance(critic.layers[-1], nn.Sigmoid) for critic in critics):
-            raise ValueError("loss.td_criterion: 'cross_entropy' needs critics with output 'Sigmoid'")
+            raise ArgumentError("loss.td_criterion: 'cross_entropy' needs critics with output 'Sigmoid'")
         if target_critics not in ("min", "mean"):
-            raise ValueError(f"loss.target_critics: expected 'min' or 'mean', got {target_critics!r}")
+            raise ArgumentError(f"loss.target_critics: expected 'min' or 'mean', got {target_critics!r}")
         if model_steps < 1:
-            raise ValueError(f"loss.model_steps: expected at least 1, got {model_steps}")
+            raise ArgumentError(f"loss.model_steps: expected at least 1, got {model_steps}")
         for critic in critics:
             require_twice_differentiable(critic.layers)
         one = torch.ones(problem.controls.dim)

@@ -13,6 +13,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from pirl_rl.errors import ArgumentError
+
 
 class Payoff(Protocol):
     """l_eps as a function of the normalised level: (*) -> (*) in [0, 1], 1 for d <= -epsilon, 0 for d > 0."""
@@ -31,7 +33,7 @@ class Indicator:
 
     def __post_init__(self):
         if self.epsilon != 0:
-            raise ValueError(f"Indicator: epsilon is 0 by definition, got {self.epsilon}")
+            raise ArgumentError(f"Indicator: epsilon is 0 by definition, got {self.epsilon}")
 
     def __call__(self, level: Tensor) -> Tensor:
         return (level <= 0).to(level.dtype)
@@ -43,7 +45,7 @@ class _Smoothed:
 
     def __post_init__(self):
         if not self.epsilon > 0:
-            raise ValueError(f"{type(self).__name__}: epsilon must be positive, got {self.epsilon}")
+            raise ArgumentError(f"{type(self).__name__}: epsilon must be positive, got {self.epsilon}")
 
     def _ramp(self, level: Tensor) -> Tensor:
         return (-level / self.epsilon).clamp(0, 1)

@@ -15,12 +15,9 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
+from pirl_rl.errors import ProblemError
 from pirl_rl.payoffs import Indicator, Payoff
 from pirl_rl.sets import Box, Plane
-
-
-class ProblemError(ValueError):
-    """A problem that contradicts itself; the message names the part and a point."""
 
 
 class ReachAvoidProblem(ABC):
@@ -78,7 +75,7 @@ class ReachAvoidProblem(ABC):
         """(*, n) -> (*) bool: states outside A and B from which V = 0 is known."""
         return torch.zeros(x.shape[:-1], dtype=torch.bool, device=x.device)
 
-    def faces(self, count: int, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor] | None:
+    def faces(self, count: int, rng: torch.Generator | None = None) -> tuple[Tensor, Tensor] | None:
         """Points (count, n) on the faces of A and B and the value V (count,) there, for sets too thin to be found by
         sampling; None leaves it to bisection on the level functions."""
         return None
@@ -135,9 +132,9 @@ class ReachAvoidProblem(ABC):
 
 def has_controlled_noise(problem: ReachAvoidProblem, points: int = 256, seed: int = 0) -> bool:
     """Whether sigma depends on u, found on sampled states and pairs of controls."""
-    generator = torch.Generator().manual_seed(seed)
-    x = problem.states.sample(points, generator)
-    one, other = (problem.diffusion(x, problem.controls.sample(points, generator)) for _ in range(2))
+    rng = torch.Generator().manual_seed(seed)
+    x = problem.states.sample(points, rng)
+    one, other = (problem.diffusion(x, problem.controls.sample(points, rng)) for _ in range(2))
     return not torch.equal(one, other)
 
 
@@ -164,9 +161,9 @@ def check_problem(problem: ReachAvoidProblem, points: int = 100_000, seed: int =
             raise ProblemError(f"{name} has no {attribute}")
     if not problem.horizon > 0:
         raise ProblemError(f"{name}: horizon must be positive, got {problem.horizon}")
-    generator = torch.Generator().manual_seed(seed)
-    x = problem.states.expand(1.5).sample(points, generator, dtype=torch.float64)
-    u = problem.controls.sample(16, generator, dtype=torch.float64)
+    rng = torch.Generator().manual_seed(seed)
+    x = problem.states.expand(1.5).sample(points, rng, dtype=torch.float64)
+    u = problem.controls.sample(16, rng, dtype=torch.float64)
     few, n = x[:16], problem.states.dim
     _expect_shape(f"{name}.drift", problem.drift(few, u), (16, n))
     sigma = problem.diffusion(few, u)

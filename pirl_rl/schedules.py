@@ -6,6 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import Protocol
 
+from pirl_rl.errors import ArgumentError
+
 Weights = tuple[float, float, float]
 
 
@@ -20,7 +22,7 @@ class Schedule(Protocol):
 def _weights(name: str, values: Sequence[float]) -> Weights:
     numbers = tuple(float(value) for value in values)
     if len(numbers) != 3 or not all(math.isfinite(value) and value >= 0 for value in numbers):
-        raise ValueError(
+        raise ArgumentError(
             f"schedule.{name}: expected three finite weights >= 0 as [td, hjb, boundary], got {list(values)}"
         )
     return numbers  # type: ignore[return-value]
@@ -53,7 +55,7 @@ class LossSchedule(_Transition):
     def __init__(self, initial: Sequence[float], final: Sequence[float], center: float, steepness: float):
         super().__init__(initial, final)
         if not (math.isfinite(center) and math.isfinite(steepness) and steepness > 0):
-            raise ValueError(f"schedule: expected finite center and steepness > 0, got {center} and {steepness}")
+            raise ArgumentError(f"schedule: expected finite center and steepness > 0, got {center} and {steepness}")
         self.center, self.steepness = float(center), float(steepness)
 
     def progress(self, update: float) -> float:
@@ -66,7 +68,7 @@ class LinearSchedule(_Transition):
     def __init__(self, initial: Sequence[float], final: Sequence[float], start: float, end: float):
         super().__init__(initial, final)
         if not end > start:
-            raise ValueError(f"schedule: expected end > start, got start={start}, end={end}")
+            raise ArgumentError(f"schedule: expected end > start, got start={start}, end={end}")
         self.start, self.end = float(start), float(end)
 
     def progress(self, update: float) -> float:

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pirl_rl.errors import ArgumentError
+
 
 class Box:
     """The box {x : low <= x <= high} in R^n, in the units of the problem.
@@ -29,10 +31,12 @@ class Box:
         self.low = tuple(float(value) for value in low)
         self.high = tuple(float(value) for value in high)
         if len(self.low) != len(self.high) or not self.low:
-            raise ValueError(f"Box: low and high need the same length >= 1, got {len(self.low)} and {len(self.high)}")
+            raise ArgumentError(
+                f"Box: low and high need the same length >= 1, got {len(self.low)} and {len(self.high)}"
+            )
         for axis, (a, b) in enumerate(zip(self.low, self.high, strict=True)):
             if not (math.isfinite(a) and math.isfinite(b) and a < b):
-                raise ValueError(f"Box: axis {axis} needs finite low < high, got low={a}, high={b}")
+                raise ArgumentError(f"Box: axis {axis} needs finite low < high, got low={a}, high={b}")
         self._cache: dict[tuple[torch.dtype, torch.device], tuple[Tensor, Tensor]] = {}
 
     @property
@@ -64,12 +68,12 @@ class Box:
     def sample(
         self,
         count: int,
-        generator: torch.Generator | None = None,
+        rng: torch.Generator | None = None,
         dtype: torch.dtype | None = None,
         device: torch.device | str | None = None,
     ) -> Tensor:
         """Uniform points (count, n)."""
-        unit = torch.rand(count, self.dim, generator=generator, dtype=dtype, device=device)
+        unit = torch.rand(count, self.dim, generator=rng, dtype=dtype, device=device)
         return self.denormalize(2 * unit - 1)
 
     def expand(self, factor: float) -> Box:

@@ -20,6 +20,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
 
 
@@ -58,20 +59,20 @@ class Simulator:
 
     def __post_init__(self):
         if not 0 < self.dt <= self.problem.horizon:
-            raise ValueError(f"dt: expected 0 < dt <= horizon = {self.problem.horizon}, got {self.dt}")
+            raise ArgumentError(f"dt: expected 0 < dt <= horizon = {self.problem.horizon}, got {self.dt}")
         if not (isinstance(self.substeps, int) and self.substeps >= 1):
-            raise ValueError(f"substeps: expected an integer >= 1, got {self.substeps!r}")
+            raise ArgumentError(f"substeps: expected an integer >= 1, got {self.substeps!r}")
         if self.crossing not in ("bridge", "endpoint"):
-            raise ValueError(f"crossing: expected 'bridge' or 'endpoint', got {self.crossing!r}")
+            raise ArgumentError(f"crossing: expected 'bridge' or 'endpoint', got {self.crossing!r}")
 
     @torch.no_grad()
-    def step(self, x: Tensor, u: Tensor, generator: torch.Generator | None = None, dt: Tensor | None = None) -> Step:
+    def step(self, x: Tensor, u: Tensor, rng: torch.Generator | None = None, dt: Tensor | None = None) -> Step:
         """Advance paths that are outside A and B by one control step.
 
         Args:
             x: states (N, n).
             u: physical controls (N, m), held.
-            generator: source of the noise.
+            rng: source of the noise.
             dt: lengths (N,) of this step where they differ between paths; default `self.dt`.
         """
         # Column by column in memory, as the physics reads states.
@@ -80,8 +81,8 @@ class Simulator:
         reached = torch.zeros(x.shape[:-1], dtype=torch.bool, device=x.device)
         failed = reached
         for index in range(self.substeps):
-            moved, sigma = self._euler_maruyama(x, u, h, generator)
-            now_reached, now_failed = self._exits(x, moved, sigma, h, generator)
+            moved, sigma = self._euler_maruyama(x, u, h, rng)
+            now_reached, now_failed = self._exits(x, moved, sigma, h, rng)
             if index == 0:
                 x, reached, failed = moved, now_reached & ~now_failed, now_failed
                 continue
@@ -97,10 +98,10 @@ class Simulator:
             x = x + self.problem.drift(x, u) * (self.dt / self.substeps)
         return x
 
-    def _euler_maruyama(self, x: Tensor, u: Tensor, h: Tensor, generator) -> tuple[Tensor, Tensor]:
+    def _euler_maruyama(self, x: Tensor, u: Tensor, h: Tensor, rng) -> tuple[Tensor, Tensor]:
         sigma = self.problem.diffusion(x, u)
         channels = sigma.shape[-1]
-        noise = torch.randn((channels, *x.shape[:-1]), generator=generator, dtype=x.dtype, device=x.device) * h.sqrt()
+        noise = torch.randn((channels, *x.shape[:-1]), generator=rng, dtype=x.dtype, device=x.device) * h.sqrt()
         if all(stride == 0 for stride in sigma.stride()[:-2]):
             # One matrix expanded to all states: a product of two matrices in place of N small ones.
             moved = (sigma[(0,) * (sigma.ndim - 2)] @ noise).mT
@@ -108,21 +109,21 @@ class Simulator:
             moved = (sigma * noise.movedim(0, -1).unsqueeze(-2)).sum(-1)
         return x + self.problem.drift(x, u) * h[..., None] + moved, sigma
 
-    def _exits(self, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor, generator) -> tuple[Tensor, Tensor]:
+    def _exits(self, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor, rng) -> tuple[Tensor, Tensor]:
         problem = self.problem
         reached, failed = problem.reached(moved), problem.failed(moved)
         if self.crossing == "endpoint":
             return reached, failed
         if problem.objective == "reach-avoid":
-            crossed, others_hold = self._crossed(problem.reached_constraints, x, moved, sigma, h, generator)
+            crossed, others_hold = self._crossed(problem.reached_constraints, x, moved, sigma, h, rng)
             reached = reached | (crossed & others_hold).any(-1)
         if problem.has_avoid_set:
-            crossed, _ = self._crossed(problem.avoid_constraints, x, moved, sigma, h, generator)
+            crossed, _ = self._crossed(problem.avoid_constraints, x, moved, sigma, h, rng)
             failed = failed | crossed.any(-1)
         return reached, failed
 
     @staticmethod
-    def _crossed(constraints, x, moved, sigma, h, generator) -> tuple[Tensor, Tensor]:
+    def _crossed(constraints, x, moved, sigma, h, rng) -> tuple[Tensor, Tensor]:
         """For each face (N, k): did the bridge cross it, and do all other constraints hold at both ends?"""
         before, after = constraints(x), constraints(moved)
         columns = [torch.func.jvp(constraints, (x,), (column,))[1] for column in sigma.unbind(-1)]
@@ -130,7 +131,7 @@ class Simulator:
         exponent = -2 * before * after / variance
         # 0/0 and inf/0: a face along which the noise does not act is not crossed between the ends.
         probability = torch.where((variance > 0) & (before > 0) & (after > 0), exponent.exp(), torch.zeros_like(before))
-        crossed = torch.rand(before.shape, generator=generator, dtype=x.dtype, device=x.device) < probability
+        crossed = torch.rand(before.shape, generator=rng, dtype=x.dtype, device=x.device) < probability
         held = (before <= 0) & (after <= 0)
         others_hold = held.sum(-1, keepdim=True) - held.long() == before.shape[-1] - 1
         return crossed, others_hold

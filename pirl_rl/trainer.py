@@ -15,26 +15,20 @@ from tensordict import TensorDict
 
 from pirl_rl import checkpoint
 from pirl_rl.collectors import TransitionCollector
-from pirl_rl.collocation import BoundarySampler, Collocation
 from pirl_rl.curriculum import Curriculum, Settings
+from pirl_rl.errors import ArgumentError, DivergenceError, Interrupted
 from pirl_rl.evaluation import Evaluator, Success, evaluate
 from pirl_rl.files import replacing
 from pirl_rl.guard import Rollback
-from pirl_rl.learner import DivergenceError, Learner
+from pirl_rl.learner import Learner
 from pirl_rl.loggers import MetricsLogger, NoLogger
 from pirl_rl.progress import Progress, interruptible
+from pirl_rl.sampling.boundary import BoundarySampler
+from pirl_rl.sampling.collocation import Collocation
 from pirl_rl.solution import Solution
 
 NEGLIGIBLE = 1e-6
 """Weights below this share of their largest of the run, as a sigmoid has far from its center, are taken for zero."""
-
-
-class Interrupted(Exception):
-    """Training was asked to stop; everything is saved."""
-
-    def __init__(self, update: int):
-        super().__init__(f"stopped at update {update}")
-        self.update = update
 
 
 class Trainer:
@@ -87,7 +81,7 @@ class Trainer:
             ("checkpoint_every", checkpoint_every, 0),
         ):
             if not (isinstance(value, int) and value >= least):
-                raise ValueError(f"trainer.{name}: expected an integer >= {least}, got {value!r}")
+                raise ArgumentError(f"trainer.{name}: expected an integer >= {least}, got {value!r}")
         self.learner, self.collector, self.collocation, self.boundary = learner, collector, collocation, boundary
         self.stages = stages or Curriculum(learner.schedule, updates)
         self._unstaged = Settings(
@@ -119,7 +113,7 @@ class Trainer:
     def _make_rollback(self) -> Rollback:
         success = next((one for one in self.during if isinstance(one, Success)), None)
         if success is None or not self.evaluate_every:
-            raise ValueError(
+            raise ArgumentError(
                 "trainer.rollback: it judges evaluations during training, expected trainer.evaluate_every >= 1 and "
                 f"success in evaluation.during, got {self.evaluate_every} and "
                 f"{[type(one).__name__ for one in self.during]}"

@@ -91,17 +91,17 @@ def stack(critics: Sequence[Critic]) -> Critic:
 
 def points(problem: ReachAvoidProblem, count: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """tau, x, normalised action and physical control, in the default dtype."""
-    generator = torch.Generator().manual_seed(seed)
+    rng = torch.Generator().manual_seed(seed)
     dtype = torch.get_default_dtype()
-    tau = problem.horizon * torch.rand(count, generator=generator, dtype=dtype)
-    x = problem.states.sample(count, generator, dtype)
-    action = 2 * torch.rand(count, problem.controls.dim, generator=generator, dtype=dtype) - 1
+    tau = problem.horizon * torch.rand(count, generator=rng, dtype=dtype)
+    x = problem.states.sample(count, rng, dtype)
+    action = 2 * torch.rand(count, problem.controls.dim, generator=rng, dtype=dtype) - 1
     return tau, x, action, problem.controls.denormalize(action)
 
 
 def make_batch(problem: ReachAvoidProblem, count: int = 24) -> TensorDict:
     """A batch for `PIRLLoss` of random transitions, collocation points (some masked) and boundary points."""
-    generator = torch.Generator().manual_seed(7)
+    rng = torch.Generator().manual_seed(7)
     here, there, inside, edge = (points(problem, count, seed) for seed in range(4))
     replay = {
         "tau": here[0].unsqueeze(-1),
@@ -111,12 +111,12 @@ def make_batch(problem: ReachAvoidProblem, count: int = 24) -> TensorDict:
         "next": {
             "tau": there[0].unsqueeze(-1),
             "state": there[1],
-            "reward": torch.rand(count, 1, generator=generator),
-            "terminated": torch.rand(count, 1, generator=generator) < 0.3,
+            "reward": torch.rand(count, 1, generator=rng),
+            "terminated": torch.rand(count, 1, generator=rng) < 0.3,
             "done": torch.ones(count, 1, dtype=torch.bool),
         },
     }
     collocation = {"tau": inside[0].unsqueeze(-1), "state": inside[1], "mask": torch.arange(count) % 3 > 0}
-    boundary = {"tau": edge[0].unsqueeze(-1), "state": edge[1], "value": torch.rand(count, generator=generator)}
+    boundary = {"tau": edge[0].unsqueeze(-1), "state": edge[1], "value": torch.rand(count, generator=rng)}
     parts = {"replay": replay, "collocation": collocation, "boundary": boundary}
     return TensorDict({key: TensorDict(part, batch_size=[count]) for key, part in parts.items()})

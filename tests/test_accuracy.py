@@ -39,9 +39,9 @@ class Known:
 
 
 def states(count: int = 400) -> ReferenceStates:
-    generator = torch.Generator().manual_seed(2)
-    tau, x = 2 * torch.rand(count, generator=generator), 4 * torch.rand(count, 1, generator=generator) - 2
-    return ReferenceStates.from_visited(Reach1D(), tau, x, Box([0.0, -2.0], [2.0, 2.0]), generator, count)
+    rng = torch.Generator().manual_seed(2)
+    tau, x = 2 * torch.rand(count, generator=rng), 4 * torch.rand(count, 1, generator=rng) - 2
+    return ReferenceStates.from_visited(Reach1D(), tau, x, Box([0.0, -2.0], [2.0, 2.0]), rng, count)
 
 
 def by_hand() -> AccuracyEvidence:

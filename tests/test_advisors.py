@@ -9,11 +9,11 @@ import pytest
 from omegaconf import OmegaConf
 from rounds import after, history, improves, plan, request
 
-from pirl_rl.configuration import CONF, ConfigError, build
-from pirl_rl.outer_loop.advisors import AdvisorError
+from pirl_rl.configuration import CONF, build
+from pirl_rl.errors import AdvisorError, ConfigError, PlanError
 from pirl_rl.outer_loop.advisors.file import File
 from pirl_rl.outer_loop.advisors.greedy import Greedy
-from pirl_rl.outer_loop.parsing import MAX_ANSWER, PlanError, parse_plan
+from pirl_rl.outer_loop.parsing import MAX_ANSWER, parse_plan
 from pirl_rl.outer_loop.plan import Plan
 
 

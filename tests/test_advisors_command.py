@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 from rounds import after, history, improves, request
 
-from pirl_rl.outer_loop.advisors import AdvisorError
+from pirl_rl.errors import AdvisorError, PlanError
 from pirl_rl.outer_loop.advisors.command import TAIL, Command
-from pirl_rl.outer_loop.parsing import PlanError, parse_plan
+from pirl_rl.outer_loop.parsing import parse_plan
 from pirl_rl.outer_loop.prompt import asked
 
 AGENT = (Path(__file__).parent / "agent.py").read_text()

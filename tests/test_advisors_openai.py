@@ -13,7 +13,8 @@ import pytest
 from chat_server import Handler, chat, serving
 from rounds import history, plan, request
 
-from pirl_rl.outer_loop.advisors import AdvisorError, openai
+from pirl_rl.errors import AdvisorError
+from pirl_rl.outer_loop.advisors import openai
 from pirl_rl.outer_loop.advisors.openai import OpenAI
 from pirl_rl.outer_loop.parsing import parse_plan
 

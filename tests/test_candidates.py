@@ -15,7 +15,8 @@ from small import small_trainer
 
 from pirl_rl import checkpoint
 from pirl_rl.assembly import begin
-from pirl_rl.configuration import CONF, ConfigError
+from pirl_rl.configuration import CONF
+from pirl_rl.errors import ConfigError
 from pirl_rl.outer_loop.candidates import Task, job, overrides, quoted, result, settle
 from pirl_rl.outer_loop.history import Result
 from pirl_rl.outer_loop.plan import Candidate
@@ -117,11 +118,11 @@ def test_weights_of_the_start_are_those_of_its_last_update(tmp_path):
     schedule = (
         "{updates: 5, schedule: {_target_: pirl_rl.schedules.LinearSchedule, initial: [1, 0, 1], final: [1, 1, 3]"
     )
-    visited = "{_target_: pirl_rl.collocation.ReplayCollocation, jitter: [0.1, 0.2], replay_share: [1, 0.5]}"
+    visited = "{_target_: pirl_rl.sampling.collocation.ReplayCollocation, jitter: [0.1, 0.2], replay_share: [1, 0.5]}"
     stages = f"stages=[{{updates: 5}}, {schedule}, start: 0, end: 5}}, collocation: {visited}}}]"
     trainer = small_trainer(tmp_path / "before", stages, "trainer.updates=10", "evaluation.final=[success,calibration]")
     trainer.train()
-    collocation = "collocation._target_=pirl_rl.collocation.ReplayCollocation"
+    collocation = "collocation._target_=pirl_rl.sampling.collocation.ReplayCollocation"
     candidates = small_trainer(tmp_path / "next", collocation, "evaluation.final=[success,calibration]")
     path = begin(candidates, str(tmp_path / "before"))
     begun = measure(candidates, path)

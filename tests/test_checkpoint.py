@@ -15,7 +15,8 @@ import torch
 from small import resumed, small_trainer
 
 from pirl_rl import load_run
-from pirl_rl.checkpoint import LAST, CheckpointError, load, restore_rng, save
+from pirl_rl.checkpoint import LAST, load, restore_rng, save
+from pirl_rl.errors import CheckpointError
 
 STATE = {"loss": {"weight": torch.arange(1000.0)}, "update": 3, "rng": torch.get_rng_state(), "names": ("a", 1, None)}
 

@@ -13,9 +13,9 @@ from small import assert_same, small_trainer
 from tensordict import TensorDict
 
 from pirl_rl.assembly import restore
-from pirl_rl.collectors import CollectorError
 from pirl_rl.collectors.transitions import TRANSITION, Exploration, Transitions
-from pirl_rl.envs import Reach1DEnv
+from pirl_rl.errors import CollectorError
+from pirl_rl.problems.reach1d_env import Reach1DEnv
 
 ASYNC = ("collector=multi_async", "collector.updates_per_batch=2", "collector.warmup_frames=128")
 

@@ -7,23 +7,24 @@ import torch
 from oracles import PROBLEMS, Corner, name
 from tensordict import TensorDict
 
-from pirl_rl.collocation import BoundarySampler, Collocation, ReplayCollocation
-from pirl_rl.problem import ProblemError
+from pirl_rl.errors import ProblemError
 from pirl_rl.problems import Reach1D, Safety1D, VehicleDrift
+from pirl_rl.sampling.boundary import BoundarySampler
+from pirl_rl.sampling.collocation import Collocation, ReplayCollocation
 from pirl_rl.sets import Box
 
 SAMPLERS = pytest.mark.parametrize("sampler", ["uniform", "sobol"])
 problems = pytest.mark.parametrize("problem", [*PROBLEMS, Corner()], ids=name)
 
 
-def rng(seed: int = 0) -> torch.Generator:
+def make_rng(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
 @problems
 @SAMPLERS
 def test_interior_points_lie_in_the_box_and_are_masked_where_the_equation_does_not_hold(problem, sampler):
-    points = Collocation(problem, 3_000, sampler, widen=1.5).sample(rng())
+    points = Collocation(problem, 3_000, sampler, widen=1.5).sample(make_rng())
     tau, x, mask = points["tau"], points["state"], points["mask"]
     assert (tau.shape, x.shape, mask.shape) == ((3_000, 1), (3_000, problem.states.dim), (3_000,))
     assert (tau > 0).all()
@@ -35,7 +36,7 @@ def test_interior_points_lie_in_the_box_and_are_masked_where_the_equation_does_n
 
 @problems
 def test_points_outside_time_are_masked(problem):
-    x = Collocation(problem, 200).sample(rng())["state"]
+    x = Collocation(problem, 200).sample(make_rng())["state"]
     x = x[problem.interior(x)][:3]
     x = x[:1].expand(4, -1)
     tau = problem.horizon * torch.tensor([[-0.1], [0.0], [1.0], [1.01]])
@@ -44,7 +45,7 @@ def test_points_outside_time_are_masked(problem):
 
 @SAMPLERS
 def test_widened_box_is_covered_to_its_edges(sampler):
-    x = Collocation(Reach1D(), 4_000, sampler, widen=2.0).sample(rng())["state"]
+    x = Collocation(Reach1D(), 4_000, sampler, widen=2.0).sample(make_rng())["state"]
     assert x.abs().max() > 3.95
     assert x.mean().item() == pytest.approx(0, abs=5 * (16 / 3 / 4_000) ** 0.5)
 
@@ -52,11 +53,11 @@ def test_widened_box_is_covered_to_its_edges(sampler):
 def test_sobol_points_are_more_even_than_random_ones():
     """2^10 scrambled points: each of 32 equal strips of either axis has its share, up to one point."""
     problem = Reach1D()
-    points = Collocation(problem, 1024, "sobol").sample(rng())
+    points = Collocation(problem, 1024, "sobol").sample(make_rng())
     for unit in (points["tau"] / problem.horizon, (points["state"] + 2) / 4):
         counts = torch.histc(unit, 32, 0, 1)
         assert (counts - 32).abs().max() <= 1
-    random = Collocation(problem, 1024, "uniform").sample(rng())
+    random = Collocation(problem, 1024, "uniform").sample(make_rng())
     assert (torch.histc((random["state"] + 2) / 4, 32, 0, 1) - 32).abs().max() > 5
 
 
@@ -64,7 +65,7 @@ def test_sobol_points_are_more_even_than_random_ones():
 @SAMPLERS
 def test_law_of_tau(sampler, power):
     """E[tau] = T/(power + 1), within five standard errors of random points."""
-    tau = Collocation(Reach1D(), 20_000, sampler, tau_power=power).sample(rng())["tau"]
+    tau = Collocation(Reach1D(), 20_000, sampler, tau_power=power).sample(make_rng())["tau"]
     deviation = (4 / (2 * power + 1) - (2 / (power + 1)) ** 2) ** 0.5
     assert tau.mean().item() == pytest.approx(2 / (power + 1), abs=5 * deviation / 20_000**0.5)
 
@@ -72,7 +73,7 @@ def test_law_of_tau(sampler, power):
 @pytest.mark.parametrize("power", [1.0, 2.0])
 def test_law_of_tau_on_faces(power):
     """P(tau <= q T) = q^(1/power), within five standard errors."""
-    tau = BoundarySampler(Reach1D(), 0, 20_000, tau_power=power).sample(rng())["tau"]
+    tau = BoundarySampler(Reach1D(), 0, 20_000, tau_power=power).sample(make_rng())["tau"]
     for q in (0.04, 0.25, 0.64):
         share = q ** (1 / power)
         error = 5 * (share * (1 - share) / 20_000) ** 0.5
@@ -81,9 +82,9 @@ def test_law_of_tau_on_faces(power):
 
 @SAMPLERS
 def test_same_generator_same_points_and_no_draw_repeats(sampler):
-    collocation, generator = Collocation(Reach1D(), 64, sampler), rng()
-    first, second = collocation.sample(generator), collocation.sample(generator)
-    assert torch.equal(first["state"], collocation.sample(rng())["state"])
+    collocation, rng = Collocation(Reach1D(), 64, sampler), make_rng()
+    first, second = collocation.sample(rng), collocation.sample(rng)
+    assert torch.equal(first["state"], collocation.sample(make_rng())["state"])
     assert not torch.equal(first["state"], second["state"])
 
 
@@ -97,7 +98,7 @@ def distance_to_faces(problem, x):
 
 @problems
 def test_faces_lie_on_faces_with_the_value_there(problem):
-    points = BoundarySampler(problem, initial=0, faces=2_000).sample(rng())
+    points = BoundarySampler(problem, initial=0, faces=2_000).sample(make_rng())
     tau, x, value = points["tau"][:, 0], points["state"], points["value"]
     assert (tau > 0).all()
     assert (tau <= problem.horizon).all()
@@ -114,25 +115,25 @@ def test_faces_lie_on_faces_with_the_value_there(problem):
 
 
 def test_every_face_of_a_square_is_found():
-    x = BoundarySampler(Corner(), initial=0, faces=2_000).sample(rng())["state"]
+    x = BoundarySampler(Corner(), initial=0, faces=2_000).sample(make_rng())["state"]
     for level in ((x - 0.5).abs(), (x + 0.5).abs()):
         assert ((level < 1e-6).float().mean(0) > 0.1).all()
 
 
 @problems
 def test_initial_points_are_outside_both_sets_at_tau_zero(problem):
-    points = BoundarySampler(problem, initial=500, faces=0).sample(rng())
+    points = BoundarySampler(problem, initial=500, faces=0).sample(make_rng())
     assert (points["tau"] == 0).all()
     assert problem.interior(points["state"]).all()
     assert torch.equal(points["value"], torch.full((500,), float(problem.objective == "invariance")))
 
 
 def test_sizes_add_up_and_draws_differ():
-    sampler, generator = BoundarySampler(Safety1D(), initial=30, faces=50), rng()
-    first, second = sampler.sample(generator), sampler.sample(generator)
+    sampler, rng = BoundarySampler(Safety1D(), initial=30, faces=50), make_rng()
+    first, second = sampler.sample(rng), sampler.sample(rng)
     assert (len(first), int((first["tau"] == 0).sum())) == (80, 30)
     assert not torch.equal(first["state"], second["state"])
-    assert torch.equal(first["state"], sampler.sample(rng())["state"])
+    assert torch.equal(first["state"], sampler.sample(make_rng())["state"])
 
 
 class Needle(Reach1D):
@@ -143,14 +144,14 @@ class Needle(Reach1D):
 
 
 class MarkedNeedle(Needle):
-    def faces(self, count, generator=None):
+    def faces(self, count, rng=None):
         return torch.ones(count, 1, dtype=torch.float64), torch.ones(count, dtype=torch.float64)
 
 
 def test_a_set_too_thin_to_be_found_is_named_and_its_own_faces_are_taken():
     with pytest.raises(ProblemError, match=r"Needle: neither target nor avoid set found .* give faces"):
         BoundarySampler(Needle())
-    points = BoundarySampler(MarkedNeedle(), initial=0, faces=10).sample(rng())
+    points = BoundarySampler(MarkedNeedle(), initial=0, faces=10).sample(make_rng())
     assert torch.equal(points["state"], torch.ones(10, 1))
     assert torch.equal(points["value"], torch.ones(10))
 
@@ -178,9 +179,9 @@ def test_expanded_box_of_the_sampler():
 
 def visited(problem, count=500):
     """Transitions at states outside the sets, at most of the horizon to go."""
-    generator = rng(3)
-    tau = problem.horizon * (0.5 + 0.4 * torch.rand(count, 1, generator=generator))
-    x = problem.states.sample(4 * count, generator)
+    rng = make_rng(3)
+    tau = problem.horizon * (0.5 + 0.4 * torch.rand(count, 1, generator=rng))
+    x = problem.states.sample(4 * count, rng)
     x = x[problem.interior(x) & ~problem.unreachable(x)][:count]
     return TensorDict({"tau": tau[: len(x)], "state": x}, batch_size=[len(x)])
 
@@ -195,7 +196,7 @@ def test_points_near_visited_ones_move_with_the_schedule(progress):
     problem = VehicleDrift()
     replay, size = visited(problem), 4_000
     sampler = ReplayCollocation(problem, size, replay_share=(0.9, 0.5), jitter=(0.01, 0.03))
-    points = sampler.sample(rng(), replay, progress)
+    points = sampler.sample(make_rng(), replay, progress)
     nearest = torch.cdist(normalised(problem, points), normalised(problem, replay)).amin(1)
     share, jitter = 0.9 - 0.4 * progress, 0.01 + 0.02 * progress
     # Beyond 6 deviations lies 1e-4 of the chi law with 8 degrees of freedom; uniform points are hardly ever that near.
@@ -207,7 +208,7 @@ def test_points_near_visited_ones_move_with_the_schedule(progress):
 
 def test_without_a_replay_all_points_are_uniform():
     problem = Reach1D()
-    assert_equal_points(ReplayCollocation(problem, 50).sample(rng()), Collocation(problem, 50).sample(rng()))
+    assert_equal_points(ReplayCollocation(problem, 50).sample(make_rng()), Collocation(problem, 50).sample(make_rng()))
 
 
 def assert_equal_points(ours, theirs):
@@ -231,7 +232,7 @@ def test_replay_collocation_names_the_key(kwargs, message):
 def test_visited_states_take_their_share_of_the_points_at_the_end_of_time():
     problem = VehicleDrift()
     replay = visited(problem)
-    points = BoundarySampler(problem, initial=200, faces=50, replay_share=0.25).sample(rng(), replay)
+    points = BoundarySampler(problem, initial=200, faces=50, replay_share=0.25).sample(make_rng(), replay)
     assert (points["tau"][:200] == 0).all()
     known = (points["state"].unsqueeze(1) == replay["state"]).all(-1).any(-1)
     assert known.tolist() == [True] * 50 + [False] * 200

@@ -10,7 +10,8 @@ from omegaconf import OmegaConf
 from small import small_config, small_trainer
 
 from pirl_rl import load_run
-from pirl_rl.configuration import CONFIG, ConfigError, build, load_config, resolve
+from pirl_rl.configuration import CONFIG, build, load_config, resolve
+from pirl_rl.errors import ConfigError
 from pirl_rl.problems import Reach1D
 
 MODULE = """

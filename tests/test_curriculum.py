@@ -9,11 +9,10 @@ import torch
 from small import assert_same, at_update, interrupt, resumed, small_trainer
 
 from pirl_rl import checkpoint
-from pirl_rl.configuration import ConfigError
 from pirl_rl.curriculum import Curriculum, Stage
-from pirl_rl.plots import read_metrics
+from pirl_rl.errors import ConfigError, Interrupted
+from pirl_rl.figures.run import read_metrics
 from pirl_rl.schedules import ConstantSchedule, LinearSchedule, LossSchedule
-from pirl_rl.trainer import Interrupted
 
 WHOLE = LossSchedule([1, 0, 0], [0, 1, 1], center=50, steepness=0.1)
 
@@ -58,9 +57,10 @@ def test_errors(make, message):
 
 
 STAGES = (
-    "stages=[{updates: 1, initial_states: {_target_: pirl_rl.initial_states.UniformStates, low: [0], high: [1]}},"
+    "stages=[{updates: 1, "
+    "initial_states: {_target_: pirl_rl.sampling.initial_states.UniformStates, low: [0], high: [1]}},"
     "{updates: 1, actor_every: 5, n_steps: 3, model_steps: 4, "
-    "collocation: {_target_: pirl_rl.collocation.ReplayCollocation, size: 7}}]",
+    "collocation: {_target_: pirl_rl.sampling.collocation.ReplayCollocation, size: 7}}]",
     "trainer.updates=10",
 )
 

@@ -10,9 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from pirl_rl.envs import DriftEnv
 from pirl_rl.payoffs import LipschitzPayoff
-from pirl_rl.problems import VehicleDrift, VehicleDrift3, equilibria, vehicle
+from pirl_rl.problems import VehicleDrift, VehicleDrift3
+from pirl_rl.problems.drift import equilibria, vehicle
+from pirl_rl.problems.drift.env import DriftEnv
 from pirl_rl.simulator import Simulator
 
 GOLDEN = np.load(Path(__file__).parent / "data" / "drift_golden.npz")
@@ -48,9 +49,9 @@ def test_tyre_curves():
 
 def test_axle_forces_are_those_of_the_slip_angles():
     """Against atan2 and the polynomial, as the formulas are published; slips beyond 90 degrees included."""
-    generator = torch.Generator().manual_seed(0)
+    rng = torch.Generator().manual_seed(0)
     v_x, v_y, r, delta, friction = (
-        low + (high - low) * torch.rand(2_000, generator=generator, dtype=torch.float64)
+        low + (high - low) * torch.rand(2_000, generator=rng, dtype=torch.float64)
         for low, high in ((0.1, 15.0), (-15.0, 15.0), (-3.0, 3.0), (-1.2, 1.2), (0.3, 1.0))
     )
     drive = 5_000 * friction
@@ -229,9 +230,9 @@ def test_published_equilibrium():
 def test_three_states_are_the_seven_where_the_wheels_point_ahead():
     """With delta = 0 the missing cosine is 1: same r', v_x', and beta' = d/dt atan2(v_y, v_x), at any friction."""
     for friction in (0.4, 0.55, 0.9):
-        problem, generator = VehicleDrift3(friction=friction), torch.Generator().manual_seed(0)
-        x = problem.states.sample(500, generator, torch.float64)
-        u = problem.controls.sample(500, generator, torch.float64)
+        problem, rng = VehicleDrift3(friction=friction), torch.Generator().manual_seed(0)
+        x = problem.states.sample(500, rng, torch.float64)
+        u = problem.controls.sample(500, rng, torch.float64)
         u[:, 0] = 0
         beta, r, v_x = x.unbind(-1)
         zero, v_y = torch.zeros_like(r), v_x * beta.tan()

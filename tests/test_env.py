@@ -8,11 +8,12 @@ from oracles import PROBLEMS, FullNoise, name
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from pirl_rl.envs import Reach1DEnv, ReachAvoidEnv
-from pirl_rl.initial_states import UniformStates
+from pirl_rl.envs import ReachAvoidEnv
+from pirl_rl.errors import ProblemError
 from pirl_rl.payoffs import SmoothPayoff
-from pirl_rl.problem import ProblemError
 from pirl_rl.problems import Reach1D, Safety1D
+from pirl_rl.problems.reach1d_env import Reach1DEnv
+from pirl_rl.sampling.initial_states import UniformStates
 
 
 def step(env, state, tau, action):

@@ -10,12 +10,12 @@ from torch import Tensor
 
 from pirl_rl.evaluation import METRICS, Calibration, ExactError, Residuals, Success, evaluate
 from pirl_rl.evaluation.reference_states import ReferenceStates
-from pirl_rl.initial_states import UniformStates
 from pirl_rl.losses import PIRLLoss
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.operators import generator
 from pirl_rl.payoffs import LipschitzPayoff
 from pirl_rl.problems import Reach1D, Safety1D
+from pirl_rl.sampling.initial_states import UniformStates
 from pirl_rl.solution import Solution
 
 EVALUATORS = [ExactError(), Calibration(32, 32), Success(500), Residuals(256)]

@@ -7,8 +7,9 @@ import torch
 from small import small_trainer
 
 from pirl_rl import load_run
-from pirl_rl.configuration import ConfigError, load_config, save_config
-from pirl_rl.export import export, main
+from pirl_rl.commands.export import export, main
+from pirl_rl.configuration import load_config, save_config
+from pirl_rl.errors import ConfigError
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from small import DRIFT, EVENTS, QUICK, command, resumed, small_trainer
 
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.problems import Reach1D, VehicleDrift
-from pirl_rl.runs import load_run
+from pirl_rl.runs.load import load_run
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
 

@@ -13,8 +13,9 @@ from small import assert_same, at_update, interrupt, resumed, small_trainer
 
 from pirl_rl.assembly import begin
 from pirl_rl.checkpoint import LAST, load
-from pirl_rl.guard import CollapseError, Guard
-from pirl_rl.trainer import Interrupted, Trainer
+from pirl_rl.errors import CollapseError, Interrupted
+from pirl_rl.guard import Guard
+from pirl_rl.trainer import Trainer
 
 GUARDED = (
     *("trainer.rollback=true", "evaluation.during=[success]", "evaluation.final=[success]"),

@@ -6,9 +6,10 @@ import pytest
 import torch
 from oracles import PROBLEMS, name
 
-from pirl_rl.initial_states import EquilibriumStates, UniformStates, VisitedStates, sample_interior
-from pirl_rl.problem import ProblemError
+from pirl_rl.errors import ProblemError
 from pirl_rl.problems import Reach1D, Safety1D, VehicleDrift
+from pirl_rl.problems.drift.starts import EquilibriumStates
+from pirl_rl.sampling.initial_states import UniformStates, VisitedStates, sample_interior
 from pirl_rl.sets import Box
 
 COUNT = 20_000
@@ -117,10 +118,10 @@ def test_the_mixture_has_its_shares():
 
 
 def test_visited_states_are_moved_by_at_most_the_radius():
-    problem, generator = VehicleDrift(), torch.Generator().manual_seed(0)
+    problem, rng = VehicleDrift(), torch.Generator().manual_seed(0)
     others = EquilibriumStates(1.0)
-    visited = others.sample(problem, 4, 50, generator, torch.float64)[1]
-    _, x = VisitedStates(others, 1.0, 0.2).sample(problem, COUNT, 50, generator, torch.float64, visited)
+    visited = others.sample(problem, 4, 50, rng, torch.float64)[1]
+    _, x = VisitedStates(others, 1.0, 0.2).sample(problem, COUNT, 50, rng, torch.float64, visited)
     box = problem.states
     distance = (box.normalize(x).unsqueeze(1) - box.normalize(visited)).norm(dim=-1).amin(1)
     near = distance <= 0.2 + 1e-9
@@ -132,12 +133,12 @@ def test_visited_states_are_moved_by_at_most_the_radius():
 
 
 def test_visited_states_take_their_share():
-    problem, generator = VehicleDrift(), torch.Generator().manual_seed(0)
+    problem, rng = VehicleDrift(), torch.Generator().manual_seed(0)
     law = VisitedStates(EquilibriumStates(1.0), 0.25, 0.0)
     visited = problem.around_equilibrium(torch.tensor([0.55]), e_y=torch.tensor([1.0]))
-    _, x = law.sample(problem, COUNT, 50, generator, torch.float32, visited)
+    _, x = law.sample(problem, COUNT, 50, rng, torch.float32, visited)
     assert (x - visited).abs().amax(-1).lt(1e-5).double().mean().item() == pytest.approx(0.25, abs=0.02)
-    none = law.sample(problem, 100, 50, generator, torch.float32)[1]
+    none = law.sample(problem, 100, 50, rng, torch.float32)[1]
     assert not (none - visited).abs().amax(-1).lt(1e-5).any()
 
 

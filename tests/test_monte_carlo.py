@@ -62,8 +62,8 @@ def test_reach1d_agrees_with_the_exact_value():
 
 def test_intervals_cover_at_their_rate():
     """Of 300 intervals of 95% all but about 15 cover; 4 deviations of that number are 15."""
-    generator = torch.Generator().manual_seed(1)
-    x = REACH.states.sample(300, generator, dtype=torch.float64)
+    rng = torch.Generator().manual_seed(1)
+    x = REACH.states.sample(300, rng, dtype=torch.float64)
     estimate = monte_carlo(REACH, REACH.optimal_control, 1.0, x, rollouts=400, dt=0.1)
     exact = REACH.exact_value(torch.ones(300, dtype=torch.float64), x)
     misses = int(((exact < estimate.low) | (exact > estimate.high)).sum())

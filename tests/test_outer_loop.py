@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from rounds import BASE, QUIET, FakeTrain, Scripted, answer, candidate, greedy, make_loop, run
 
-from pirl_rl.outer_loop.advisors import AdvisorError
+from pirl_rl.errors import AdvisorError
 from pirl_rl.outer_loop.plan import Plan
 from pirl_rl.outer_loop.report import markdown, write_report
 from pirl_rl.outer_loop.tree import best_path

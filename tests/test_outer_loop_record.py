@@ -10,7 +10,7 @@ import pytest
 from rounds import Clock, FakeTrain, Killed, Scripted, answer, greedy, make_loop, run
 
 import pirl_rl.files
-from pirl_rl.configuration import ConfigError
+from pirl_rl.errors import ConfigError
 from pirl_rl.outer_loop.directory import LOCK, locked
 from pirl_rl.outer_loop.report import write_report
 

@@ -10,9 +10,10 @@ import torch
 from oracles import PROBLEMS, SHIPPED, Corner, FullNoise, name
 from torch import Tensor
 
+from pirl_rl.errors import ProblemError
 from pirl_rl.operators import generator
 from pirl_rl.payoffs import LipschitzPayoff
-from pirl_rl.problem import ProblemError, ReachAvoidProblem, check_problem, has_controlled_noise
+from pirl_rl.problem import ReachAvoidProblem, check_problem, has_controlled_noise
 from pirl_rl.problems import Reach1D, Safety1D
 from pirl_rl.sets import Box
 

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from pirl_rl import runs
-from pirl_rl.configuration import ConfigError
-from pirl_rl.evaluation.drift_states import FILE, NETWORK_BOX, DriftStates, drift_states
+from pirl_rl.errors import ConfigError
 from pirl_rl.evaluation.reference_states import ReferenceStates, displaced, visited_by
 from pirl_rl.evaluation.trajectories import closed_loop
-from pirl_rl.initial_states import UniformStates
 from pirl_rl.problems import Reach1D, VehicleDrift
+from pirl_rl.problems.drift.reference_states import FILE, NETWORK_BOX, DriftStates, drift_states
+from pirl_rl.sampling.initial_states import UniformStates
 from pirl_rl.sets import Box
 from pirl_rl.simulator import Simulator
 
@@ -33,8 +33,8 @@ def push(tau, x):
 
 
 def visited(count: int = 60):
-    generator = torch.Generator().manual_seed(3)
-    return 2 * torch.rand(count, generator=generator), 3 * torch.rand(count, 1, generator=generator) - 1.5
+    rng = torch.Generator().manual_seed(3)
+    return 2 * torch.rand(count, generator=rng), 3 * torch.rand(count, 1, generator=rng) - 1.5
 
 
 def test_distances_and_groups_are_those_of_brute_force():
@@ -98,9 +98,9 @@ def test_visited_states_of_a_path_without_noise():
 
 def test_closed_loop_ends_paths_and_holds_them():
     """One that hits, one whose time is over first, one that began inside the target."""
-    simulator, generator = Simulator(Still(), 0.1, 1, "endpoint"), torch.Generator()
+    simulator, rng = Simulator(Still(), 0.1, 1, "endpoint"), torch.Generator()
     tau, x = torch.tensor([2.0, 0.3, 2.0]), torch.tensor([[1.55], [0.0], [2.5]])
-    paths = closed_loop(simulator, push, tau, x, generator)
+    paths = closed_loop(simulator, push, tau, x, rng)
     assert paths.state.shape == (21, 3, 1)
     assert paths.steps.tolist() == [5, 3, 0]
     assert paths.reached.tolist() == [True, False, True]
@@ -136,7 +136,7 @@ def test_what_is_saved_is_loaded(tmp_path):
 def test_wrong_arguments_are_named(change, told):
     tau, x = visited()
     with pytest.raises(ValueError, match=told):
-        ReferenceStates.from_visited(Reach1D(), tau, x, **{"box": BOX, "generator": torch.Generator()} | change)
+        ReferenceStates.from_visited(Reach1D(), tau, x, **{"box": BOX, "rng": torch.Generator()} | change)
 
 
 def test_committed_states():

@@ -11,8 +11,8 @@ BOX = Box([-1.0, 2.0, 0.0], [1.0, 6.0, 0.5])
 
 
 def levels(count: int = 3):
-    generator = torch.Generator().manual_seed(0)
-    return torch.randn(count, 500, generator=generator).unbind(0)
+    rng = torch.Generator().manual_seed(0)
+    return torch.randn(count, 500, generator=rng).unbind(0)
 
 
 def test_algebra_is_that_of_membership():

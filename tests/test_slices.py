@@ -13,7 +13,7 @@ from pirl_rl import plots
 from pirl_rl.evaluation import METRICS, Rollouts, Slices
 from pirl_rl.evaluation.slices import Section, projected_field
 from pirl_rl.problems import Reach1D, VehicleDrift
-from pirl_rl.problems.equilibria import equilibrium
+from pirl_rl.problems.drift.equilibria import equilibrium
 from pirl_rl.sets import Box, Plane
 
 

@@ -11,10 +11,11 @@ from test_checkpoint import Payload
 
 from pirl_rl import checkpoint, train
 from pirl_rl.assembly import begin
-from pirl_rl.checkpoint import LAST, CheckpointError, load
+from pirl_rl.checkpoint import LAST, load
 from pirl_rl.collectors.transitions import TRANSITION
 from pirl_rl.configuration import load_config
-from pirl_rl.trainer import Interrupted, Trainer
+from pirl_rl.errors import CheckpointError, Interrupted
+from pirl_rl.trainer import Trainer
 
 NOISELESS = ("collector.exploration_noise=0", "collector.exploration=always")
 

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from small import QUICK, command
 
 from pirl_rl import sweeps
-from pirl_rl.compare import RunError
+from pirl_rl.errors import RunError
 
 CENTERS, STEEP = ("1e3", "2e3", "4000", "8e3", "16e3"), ("1e-4", "3e-4", "0.001", "3e-3", "1e-2")
 

@@ -9,9 +9,8 @@ import pytest
 import torch
 from small import assert_same, at_update, interrupt, resumed, small_trainer
 
-from pirl_rl.checkpoint import LAST, CheckpointError, load
-from pirl_rl.learner import DivergenceError
-from pirl_rl.trainer import Interrupted
+from pirl_rl.checkpoint import LAST, load
+from pirl_rl.errors import CheckpointError, DivergenceError, Interrupted
 
 
 def last(folder) -> dict:

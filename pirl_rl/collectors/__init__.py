@@ -12,9 +12,10 @@ from typing import Any, Protocol
 
 from torchrl.data import TensorDictReplayBuffer
 
-from pirl_rl.collectors.multi_async import CollectorError, MultiAsyncCollector
+from pirl_rl.collectors.multi_async import MultiAsyncCollector
 from pirl_rl.collectors.sync import SyncCollector
-from pirl_rl.initial_states import InitialStates
+from pirl_rl.errors import CollectorError
+from pirl_rl.sampling.initial_states import InitialStates
 
 __all__ = ["CollectorError", "MultiAsyncCollector", "SyncCollector", "TransitionCollector"]
 

@@ -11,6 +11,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from pirl_rl.checkpoint import restore_rng
 from pirl_rl.collectors.transitions import TRANSITION
 from pirl_rl.envs import ReachAvoidEnv
+from pirl_rl.errors import ArgumentError
 
 
 def check_sizes(
@@ -18,15 +19,15 @@ def check_sizes(
 ) -> None:
     envs = env.batch_size[0]
     if frames_per_batch % envs or frames_per_batch < envs:
-        raise ValueError(
+        raise ArgumentError(
             f"collector.frames_per_batch: expected a multiple of env.num_envs = {envs}, got {frames_per_batch}"
         )
     if updates_per_batch < 1 or warmup_frames < 1:
-        raise ValueError(
+        raise ArgumentError(
             f"collector: expected updates_per_batch and warmup_frames >= 1, got {updates_per_batch} and {warmup_frames}"
         )
     if buffer_size < frames_per_batch:
-        raise ValueError(
+        raise ArgumentError(
             f"collector.buffer_size: expected at least frames_per_batch = {frames_per_batch}, got {buffer_size}"
         )
 
@@ -34,7 +35,7 @@ def check_sizes(
 def make_buffer(
     size: int, device: torch.device, seed: int, shared: bool = False
 ) -> tuple[TensorDictReplayBuffer, torch.Generator]:
-    """A replay buffer and the generator of its sampling."""
+    """A replay buffer and the random generator of its sampling."""
     storage = LazyTensorStorage(size, device=device, shared_init=shared)
     buffer = TensorDictReplayBuffer(storage=storage, shared=shared)
     rng = torch.Generator(device).manual_seed(seed)
@@ -69,7 +70,7 @@ def fill_buffer(
     for key in TRANSITION:
         got, expected = (entry[key].shape[1:] for entry in (transitions, example))
         if got != expected:
-            raise ValueError(f"replay buffer, {key}: expected shape {tuple(expected)}, got {tuple(got)}")
+            raise ArgumentError(f"replay buffer, {key}: expected shape {tuple(expected)}, got {tuple(got)}")
     count, size = len(transitions), buffer.storage.max_size
     order = (torch.arange(count) + state["writer"]["_cursor"]) % count  # a full buffer was written around its end
     buffer.extend(transitions.select(*TRANSITION)[order[-size:]].to(device))

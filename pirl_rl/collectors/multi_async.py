@@ -19,12 +19,9 @@ from torchrl.weight_update import SharedMemWeightSyncScheme
 from pirl_rl.collectors.buffers import buffer_state, check_sizes, fill_buffer, load_buffer, make_buffer
 from pirl_rl.collectors.transitions import Exploration, Transitions, exploring_policy
 from pirl_rl.envs import ReachAvoidEnv
-from pirl_rl.initial_states import InitialStates
+from pirl_rl.errors import ArgumentError, CollectorError
 from pirl_rl.networks import Actor
-
-
-class CollectorError(RuntimeError):
-    """A worker died or delivered nothing; the message names it."""
+from pirl_rl.sampling.initial_states import InitialStates
 
 
 class MultiAsyncCollector:
@@ -57,7 +54,7 @@ class MultiAsyncCollector:
     ):
         check_sizes(env, frames_per_batch, updates_per_batch, warmup_frames, buffer_size)
         if workers < 1:
-            raise ValueError(f"collector.workers: expected at least 1, got {workers}")
+            raise ArgumentError(f"collector.workers: expected at least 1, got {workers}")
         self.updates_per_batch, self.warmup_frames, self.patience = updates_per_batch, warmup_frames, patience
         self.buffer, self._rng = make_buffer(buffer_size, torch.device("cpu"), seed, shared=True)
         self._actor, self._seed, self._exploration = actor, seed, Exploration(exploration_noise, exploration)

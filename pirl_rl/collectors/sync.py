@@ -11,8 +11,8 @@ from pirl_rl.checkpoint import restore_rng
 from pirl_rl.collectors.buffers import buffer_state, check_sizes, fill_buffer, load_buffer, make_buffer
 from pirl_rl.collectors.transitions import Exploration, Transitions, exploring_policy
 from pirl_rl.envs import ReachAvoidEnv
-from pirl_rl.initial_states import InitialStates
 from pirl_rl.networks import Actor
+from pirl_rl.sampling.initial_states import InitialStates
 
 
 class SyncCollector:

@@ -9,6 +9,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 
+from pirl_rl.errors import ArgumentError
 from pirl_rl.networks import Actor
 
 TRANSITION = ("tau", "state", "action", "loc", *(("next", key) for key in ("tau", "state", "reward", "terminated")))
@@ -27,7 +28,7 @@ class Exploration(nn.Module):
     def __init__(self, deviation: float, when: Literal["always", "start"]):
         super().__init__()
         if deviation < 0 or when not in ("always", "start"):
-            raise ValueError(f"collector: expected noise >= 0, always or at start; got {deviation!r} and {when!r}")
+            raise ArgumentError(f"collector: expected noise >= 0, always or at start; got {deviation!r} and {when!r}")
         self.deviation, self.when = deviation, when
 
     def forward(self, loc: Tensor, is_init: Tensor) -> Tensor:
@@ -51,7 +52,7 @@ class Transitions:
 
     def __init__(self, n_steps: int):
         if n_steps < 1:
-            raise ValueError(f"collector.n_steps: expected at least 1, got {n_steps}")
+            raise ArgumentError(f"collector.n_steps: expected at least 1, got {n_steps}")
         self.n_steps = n_steps
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Mapping
 from pirl_rl.evaluation import accuracy, slices
 from pirl_rl.evaluation.accuracy import Accuracy
 from pirl_rl.evaluation.calibration import Calibration
-from pirl_rl.evaluation.drift_states import DriftStates
 from pirl_rl.evaluation.evidence import draw_evidence
 from pirl_rl.evaluation.exact_error import ExactError
 from pirl_rl.evaluation.residuals import Residuals
@@ -25,7 +24,6 @@ __all__ = [
     "METRICS",
     "Accuracy",
     "Calibration",
-    "DriftStates",
     "Evaluator",
     "ExactError",
     "Residuals",

@@ -10,10 +10,11 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from pirl_rl.evaluation.evidence import Measurement, generator_like, like
-from pirl_rl.evaluation.figures import draw_accuracy
+from pirl_rl.errors import ArgumentError
+from pirl_rl.evaluation.evidence import Measurement, like, rng_like
 from pirl_rl.evaluation.monte_carlo import mean_payoff
 from pirl_rl.evaluation.reference_states import GROUPS, ReferenceStates
+from pirl_rl.figures.evidence import draw_accuracy
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
@@ -97,7 +98,7 @@ class Accuracy(Measurement):
         seed: int = 0,
     ):
         if rollouts < 2:
-            raise ValueError(f"Accuracy: expected rollouts >= 2, got {rollouts}")
+            raise ArgumentError(f"Accuracy: expected rollouts >= 2, got {rollouts}")
         self.states, self.rollouts, self.simulators, self.seed = states, rollouts, simulators or SIMULATORS, seed
 
     def measure(self, solution: Solution) -> AccuracyEvidence:
@@ -105,7 +106,7 @@ class Accuracy(Measurement):
         tau, x = like(solution, states.tau, states.x)
         means = {}
         for name, settings in self.simulators.items():
-            simulator, noise = Simulator(problem, **settings), generator_like(solution, self.seed)
+            simulator, noise = Simulator(problem, **settings), rng_like(solution, self.seed)
             means[name] = mean_payoff(simulator, solution.policy, tau, x, self.rollouts, noise).cpu()
         value, raw = (function(tau, x).cpu().double() for function in (solution.value, solution.raw_value))
         return AccuracyEvidence(states, value, raw, ~problem.unreachable(x).cpu(), means, self.rollouts)

@@ -7,9 +7,10 @@ from typing import Literal
 
 import torch
 
-from pirl_rl.evaluation.evidence import generator_like, points_generator
+from pirl_rl.errors import ArgumentError
+from pirl_rl.evaluation.evidence import points_rng, rng_like
 from pirl_rl.evaluation.monte_carlo import mean_payoff
-from pirl_rl.initial_states import InitialStates, UniformStates
+from pirl_rl.sampling.initial_states import InitialStates, UniformStates
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
@@ -39,19 +40,19 @@ class Calibration:
         seed: int = 0,
     ):
         if points < 1 or rollouts < 2:
-            raise ValueError(f"Calibration: expected points >= 1 and rollouts >= 2, got {points} and {rollouts}")
+            raise ArgumentError(f"Calibration: expected points >= 1 and rollouts >= 2, got {points} and {rollouts}")
         self.points, self.rollouts, self.seed = points, rollouts, seed
         self.initial_states = initial_states or UniformStates()
         self.simulator = partial(Simulator, dt=dt, substeps=substeps, crossing=crossing)
 
     def __call__(self, solution: Solution) -> dict[str, float]:
         """calibration_mse, calibration_mae, and calibration_noise, the part of the former that is Monte Carlo's own."""
-        problem, generator = solution.problem, points_generator(self.seed)
-        _, x = self.initial_states.sample(problem, self.points, 1, generator, solution.dtype)
+        problem, rng = solution.problem, points_rng(self.seed)
+        _, x = self.initial_states.sample(problem, self.points, 1, rng, solution.dtype)
         x = x.to(solution.device)
-        late = 1 - torch.rand(self.points, generator=generator, dtype=solution.dtype)
+        late = 1 - torch.rand(self.points, generator=rng, dtype=solution.dtype)
         tau = problem.horizon * late.to(solution.device)
-        noise = generator_like(solution, self.seed)
+        noise = rng_like(solution, self.seed)
         mean = mean_payoff(self.simulator(problem), solution.policy, tau, x, self.rollouts, noise)
         error = solution.value(tau, x) - mean
         return {

@@ -53,12 +53,12 @@ def like(solution: Solution, *tensors: Tensor) -> tuple[Tensor, ...]:
     return tuple(tensor.to(solution.device, solution.dtype) for tensor in tensors)
 
 
-def points_generator(seed: int) -> torch.Generator:
+def points_rng(seed: int) -> torch.Generator:
     """A source of points and starts, on the CPU, independent of the noise of the same seed: were both drawn from one
     stream, a path's noise would follow from its start."""
     return torch.Generator().manual_seed(POINTS + seed)
 
 
-def generator_like(solution: Solution, seed: int) -> torch.Generator:
+def rng_like(solution: Solution, seed: int) -> torch.Generator:
     """A source of noise on the solution's device."""
     return torch.Generator(solution.device).manual_seed(seed)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.solution import Solution
 
@@ -22,7 +23,7 @@ class ExactError:
 
     def __init__(self, tau_points: int = 101, x_points: int = 201, seed: int = 0):
         if tau_points < 2 or x_points < 2:
-            raise ValueError(f"ExactError: expected tau_points, x_points >= 2, got {tau_points} and {x_points}")
+            raise ArgumentError(f"ExactError: expected tau_points, x_points >= 2, got {tau_points} and {x_points}")
         self.tau_points, self.x_points, self.seed = tau_points, x_points, seed
 
     def __call__(self, solution: Solution) -> dict[str, float]:
@@ -44,9 +45,9 @@ class ExactError:
         """tau (N,) and x (N, n) in float64."""
         count, box = self.tau_points * self.x_points, problem.states
         if box.dim > 1:
-            generator = torch.Generator().manual_seed(self.seed)
-            tau = problem.horizon * torch.rand(count, generator=generator, dtype=torch.float64)
-            return tau, box.sample(count, generator, dtype=torch.float64)
+            rng = torch.Generator().manual_seed(self.seed)
+            tau = problem.horizon * torch.rand(count, generator=rng, dtype=torch.float64)
+            return tau, box.sample(count, rng, dtype=torch.float64)
         tau = torch.linspace(0, problem.horizon, self.tau_points, dtype=torch.float64)
         x = torch.linspace(box.low[0], box.high[0], self.x_points, dtype=torch.float64)
         return tau.repeat_interleave(self.x_points), x.repeat(self.tau_points).unsqueeze(-1)

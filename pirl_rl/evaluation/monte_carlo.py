@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator, Step, exit_value
 
@@ -47,7 +48,9 @@ def wilson_interval(successes: Array, trials: int, confidence: float = 0.95) -> 
         confidence: in (0, 1).
     """
     if trials < 1 or not 0 < confidence < 1:
-        raise ValueError(f"wilson_interval: expected trials >= 1 and 0 < confidence < 1, got {trials} and {confidence}")
+        raise ArgumentError(
+            f"wilson_interval: expected trials >= 1 and 0 < confidence < 1, got {trials} and {confidence}"
+        )
     z2 = NormalDist().inv_cdf((1 + confidence) / 2) ** 2 / trials
 
     def lower(p: Array) -> Array:
@@ -82,7 +85,7 @@ def monte_carlo(
         dt: control step, s; a state's own step is tau / ceil(tau / dt), so that no time is lost.
         substeps: integration steps in it.
         crossing: how exits are watched, see `pirl_rl.simulator`.
-        seed: of the noise; torch's global generator stays untouched.
+        seed: of the noise; torch's global random generator stays untouched.
         confidence: of the Wilson interval.
 
     Raises:
@@ -90,15 +93,15 @@ def monte_carlo(
     """
     points = x if isinstance(x, Tensor) else torch.as_tensor(np.asarray(x), dtype=torch.get_default_dtype())
     if points.ndim != 2 or points.shape[-1] != problem.states.dim:
-        raise ValueError(f"x: expected shape (N, {problem.states.dim}), got {tuple(points.shape)}")
+        raise ArgumentError(f"x: expected shape (N, {problem.states.dim}), got {tuple(points.shape)}")
     times = torch.as_tensor(tau, dtype=points.dtype, device=points.device)
     if times.shape not in ((), (len(points),)) or not bool((times >= 0).all()):
-        raise ValueError(f"tau: expected a number or {len(points)} of them, all >= 0, got {tau}")
+        raise ArgumentError(f"tau: expected a number or {len(points)} of them, all >= 0, got {tau}")
     if rollouts < 1:
-        raise ValueError(f"rollouts: expected >= 1, got {rollouts}")
+        raise ArgumentError(f"rollouts: expected >= 1, got {rollouts}")
     simulator, times = Simulator(problem, dt, substeps, crossing), times.expand(len(points))
-    generator = torch.Generator(points.device).manual_seed(seed)
-    mean = mean_payoff(simulator, policy, times, points, rollouts, generator)
+    rng = torch.Generator(points.device).manual_seed(seed)
+    mean = mean_payoff(simulator, policy, times, points, rollouts, rng)
     known = _known(problem, times, points)[0]
     low, high = (torch.where(known, mean, end) for end in wilson_interval(mean * rollouts, rollouts, confidence))
     if isinstance(x, Tensor):
@@ -108,7 +111,7 @@ def monte_carlo(
 
 @torch.no_grad()
 def mean_payoff(
-    simulator: Simulator, policy: Policy, tau: Tensor, x: Tensor, rollouts: int, generator: torch.Generator
+    simulator: Simulator, policy: Policy, tau: Tensor, x: Tensor, rollouts: int, rng: torch.Generator
 ) -> Tensor:
     """Mean payoff (N,), float64, of paths from (tau, x), (N,) and (N, n); arguments as of `monte_carlo`."""
     known, value = _known(simulator.problem, tau, x)
@@ -117,7 +120,7 @@ def mean_payoff(
     count = len(unknown) * rollouts
     for start in range(0, count, CHUNK):
         path = torch.arange(start, min(start + CHUNK, count), device=x.device)
-        _add_payoffs(total, simulator, policy, steps, tau / steps, x, unknown[path // rollouts], generator)
+        _add_payoffs(total, simulator, policy, steps, tau / steps, x, unknown[path // rollouts], rng)
     return torch.where(known, value.double(), total / rollouts)
 
 
@@ -128,11 +131,11 @@ def _known(problem: ReachAvoidProblem, tau: Tensor, x: Tensor) -> tuple[Tensor, 
     return on_boundary | problem.unreachable(x), value * on_boundary
 
 
-def _add_payoffs(total: Tensor, simulator: Simulator, policy: Policy, steps, h, x, owner: Tensor, generator) -> None:
+def _add_payoffs(total: Tensor, simulator: Simulator, policy: Policy, steps, h, x, owner: Tensor, rng) -> None:
     """Simulate one path from each state x[owner] and add its payoff to total[owner]; only live paths are carried."""
     x, left, h = x[owner], steps[owner], h[owner]
     while len(owner):
-        step = simulator.step(x, policy(left * h, x).to(x.dtype), generator, dt=h)
+        step = simulator.step(x, policy(left * h, x).to(x.dtype), rng, dt=h)
         left = left - 1
         alive = ~(step.reached | step.failed) & (left > 0)
         ended = Step(*(entry[~alive] for entry in step))

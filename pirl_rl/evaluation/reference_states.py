@@ -14,11 +14,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.monte_carlo import Policy
 from pirl_rl.evaluation.trajectories import closed_loop
 from pirl_rl.files import replacing
-from pirl_rl.initial_states import InitialStates, moved
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.sampling.initial_states import InitialStates, moved
 from pirl_rl.sets import Box
 from pirl_rl.simulator import Simulator
 
@@ -50,7 +51,7 @@ class ReferenceStates:
         tau: Tensor,
         x: Tensor,
         box: Box,
-        generator: torch.Generator,
+        rng: torch.Generator,
         count: int = 512,
         radius: float = 0.40,
         neighbours: int = 10,
@@ -62,14 +63,14 @@ class ReferenceStates:
             tau: visited times to go (M,).
             x: visited states (M, n).
             box: of (tau, x), n + 1 axes; its [-1, 1] coordinates are the network's.
-            generator: of choice, direction and length.
+            rng: of choice, direction and length.
             count: states before terminal ones are dropped.
             radius: largest displacement.
             neighbours: visited states in the mean distance, at most M.
         """
         if not 1 <= neighbours <= len(x):
-            raise ValueError(f"neighbours: expected 1 to {len(x)}, the number of visited states, got {neighbours}")
-        new_tau, new_x = displaced(problem, tau, x, box, generator, count, radius)
+            raise ArgumentError(f"neighbours: expected 1 to {len(x)}, the number of visited states, got {neighbours}")
+        new_tau, new_x = displaced(problem, tau, x, box, rng, count, radius)
         visited, new = box.normalize(_joined(tau, x)), box.normalize(_joined(new_tau, new_x))
         distance = torch.cat([_mean_nearest(part, visited, neighbours) for part in new.split(CHUNK)])
         rank = distance.argsort().argsort()
@@ -90,28 +91,28 @@ class ReferenceStates:
 
 
 def displaced(
-    problem: ReachAvoidProblem, tau: Tensor, x: Tensor, box: Box, generator: torch.Generator, count: int, radius: float
+    problem: ReachAvoidProblem, tau: Tensor, x: Tensor, box: Box, rng: torch.Generator, count: int, radius: float
 ) -> tuple[Tensor, Tensor]:
     """Up to `count` of the states (M,), (M, n), each moved in a random direction of the box's coordinates by a length
     uniform in [0, radius] and clipped to the box; those in A or B or with tau = 0 are dropped."""
     if box.dim != x.shape[-1] + 1:
-        raise ValueError(f"box: expected {x.shape[-1] + 1} axes, tau first, got {box.dim}")
+        raise ArgumentError(f"box: expected {x.shape[-1] + 1} axes, tau first, got {box.dim}")
     # Without repetition as long as there are enough.
-    order = [torch.randperm(len(x), generator=generator, device=x.device) for _ in range(-(-count // len(x)))]
+    order = [torch.randperm(len(x), generator=rng, device=x.device) for _ in range(-(-count // len(x)))]
     chosen = torch.cat(order)[:count]
-    z = moved(box.normalize(_joined(tau[chosen], x[chosen])), radius, generator).clamp(-1, 1)
+    z = moved(box.normalize(_joined(tau[chosen], x[chosen])), radius, rng).clamp(-1, 1)
     tau, x = (point := box.denormalize(z))[:, 0], point[:, 1:]
     kept = problem.interior(x) & (tau > 0)
     return tau[kept], x[kept]
 
 
 def visited_by(
-    simulator: Simulator, policy: Policy, starts: InitialStates, episodes: int, generator: torch.Generator
+    simulator: Simulator, policy: Policy, starts: InitialStates, episodes: int, rng: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """tau (M,) and states (M, n) on the paths of a policy, from each start to the state before the end."""
     max_steps = round(simulator.problem.horizon / simulator.dt)
-    steps, x = starts.sample(simulator.problem, episodes, max_steps, generator, torch.get_default_dtype())
-    paths = closed_loop(simulator, policy, (steps * simulator.dt).to(x), x, generator)
+    steps, x = starts.sample(simulator.problem, episodes, max_steps, rng, torch.get_default_dtype())
+    paths = closed_loop(simulator, policy, (steps * simulator.dt).to(x), x, rng)
     index = torch.arange(len(paths.tau), device=x.device).unsqueeze(-1)
     return paths.tau[index < paths.steps], paths.state[index < paths.steps]
 

@@ -9,10 +9,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from pirl_rl.collocation import BoundarySampler, Collocation
-from pirl_rl.evaluation.evidence import generator_like, like, points_generator
+from pirl_rl.errors import ArgumentError
+from pirl_rl.evaluation.evidence import like, points_rng, rng_like
 from pirl_rl.evaluation.reference_states import ReferenceStates
-from pirl_rl.initial_states import UniformStates
+from pirl_rl.sampling.boundary import BoundarySampler
+from pirl_rl.sampling.collocation import Collocation
+from pirl_rl.sampling.initial_states import UniformStates
 from pirl_rl.simulator import Simulator, exit_value
 from pirl_rl.solution import Solution
 
@@ -50,28 +52,30 @@ class Residuals:
         seed: int = 0,
     ):
         if points < 2 or controls_per_axis < 2:
-            raise ValueError(f"Residuals: expected points, controls_per_axis >= 2, got {points}, {controls_per_axis}")
+            raise ArgumentError(
+                f"Residuals: expected points, controls_per_axis >= 2, got {points}, {controls_per_axis}"
+            )
         self.points, self.states, self.controls_per_axis, self.seed = points, states, controls_per_axis, seed
         self.simulator = partial(Simulator, dt=dt, substeps=substeps, crossing=crossing)
 
     def __call__(self, solution: Solution) -> dict[str, float]:
-        generator = points_generator(self.seed)
-        tau, x = self._interior(solution, generator)
+        rng = points_rng(self.seed)
+        tau, x = self._interior(solution, rng)
         along, largest = self._hjb(solution, tau, x)
         losses = {
             "hjb_loss": along,
             "hjb_sup_loss": largest,
-            "boundary_loss": self._boundary(solution, generator),
-            "td_loss": self._td(solution, generator),
+            "boundary_loss": self._boundary(solution, rng),
+            "td_loss": self._td(solution, rng),
         }
         slope = solution.gradient(tau, x) * solution.problem.states.center_and_half_width(x)[1]
         squares = {name: residual.square().mean().item() for name, residual in losses.items()}
         return {**squares, "value_slope": slope.norm(dim=-1).mean().item()}
 
-    def _interior(self, solution: Solution, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def _interior(self, solution: Solution, rng: torch.Generator) -> tuple[Tensor, Tensor]:
         collocation = Collocation(solution.problem, self.points, sampler="sobol")
         if self.states is None:
-            points = collocation.sample(generator)
+            points = collocation.sample(rng)
             tau, x, mask = points["tau"], points["state"], points["mask"]
         else:
             states = self.states()
@@ -89,18 +93,18 @@ class Residuals:
             largest = torch.maximum(largest, solution.residual(tau, x, u))
         return along, largest
 
-    def _boundary(self, solution: Solution, generator: torch.Generator) -> Tensor:
+    def _boundary(self, solution: Solution, rng: torch.Generator) -> Tensor:
         half = self.points // 2
-        points = BoundarySampler(solution.problem, initial=self.points - half, faces=half).sample(generator)
+        points = BoundarySampler(solution.problem, initial=self.points - half, faces=half).sample(rng)
         tau, x, value = like(solution, points["tau"].squeeze(-1), points["state"], points["value"])
         return solution.raw_value(tau, x) - value
 
-    def _td(self, solution: Solution, generator: torch.Generator) -> Tensor:
+    def _td(self, solution: Solution, rng: torch.Generator) -> Tensor:
         problem, simulator = solution.problem, self.simulator(solution.problem)
         max_steps = round(problem.horizon / simulator.dt)
-        steps, x = UniformStates().sample(problem, self.points, max_steps, generator, solution.dtype)
+        steps, x = UniformStates().sample(problem, self.points, max_steps, rng, solution.dtype)
         tau, tau_next, x = like(solution, steps * simulator.dt, (steps - 1) * simulator.dt, x)
-        noise = generator_like(solution, self.seed)
+        noise = rng_like(solution, self.seed)
         step = simulator.step(x, solution.policy(tau, x), noise)
         ended = step.reached | step.failed | (steps == 1).to(solution.device)
         target = torch.where(ended, exit_value(problem, step), solution.raw_value(tau_next, step.state))

@@ -9,10 +9,11 @@ from typing import Literal
 import torch
 from matplotlib.figure import Figure
 
-from pirl_rl.evaluation.evidence import Measurement, generator_like
-from pirl_rl.evaluation.figures import draw_rollouts
+from pirl_rl.errors import ArgumentError
+from pirl_rl.evaluation.evidence import Measurement, rng_like
 from pirl_rl.evaluation.slices import Section
 from pirl_rl.evaluation.trajectories import Trajectories, closed_loop
+from pirl_rl.figures.evidence import draw_rollouts
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
@@ -58,7 +59,7 @@ class Rollouts(Measurement):
         seed: int = 0,
     ):
         if paths < 1 or points < 2:
-            raise ValueError(f"Rollouts: expected paths >= 1 and points >= 2, got {paths} and {points}")
+            raise ArgumentError(f"Rollouts: expected paths >= 1 and points >= 2, got {paths} and {points}")
         self.paths, self.points, self.seed = paths, points, seed
         self.simulator = partial(Simulator, dt=dt, substeps=substeps, crossing=crossing)
 
@@ -72,6 +73,6 @@ class Rollouts(Measurement):
         starts = torch.stack([(value - level).abs().argmin() for level in LEVELS])
         index = starts.repeat_interleave(self.paths).to(first.x.device)
         tau, x = first.tau[index], first.x[index]
-        paths = closed_loop(self.simulator(problem), solution.policy, tau, x, generator_like(solution, self.seed))
+        paths = closed_loop(self.simulator(problem), solution.policy, tau, x, rng_like(solution, self.seed))
         paths = Trajectories(*(entry.cpu() for entry in vars(paths).values()))
         return RolloutsEvidence(sections, paths, value[starts].tolist())

@@ -10,9 +10,10 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from pirl_rl.evaluation.evidence import Measurement, generator_like, like
-from pirl_rl.evaluation.figures import draw_slice
+from pirl_rl.errors import ArgumentError
+from pirl_rl.evaluation.evidence import Measurement, like, rng_like
 from pirl_rl.evaluation.monte_carlo import mean_payoff
+from pirl_rl.figures.evidence import draw_slice
 from pirl_rl.sets import Plane
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
@@ -93,7 +94,7 @@ class Slices(Measurement):
         seed: int = 0,
     ):
         if points < 2 or rollouts < 1:
-            raise ValueError(f"Slices: expected points >= 2 and rollouts >= 1, got {points} and {rollouts}")
+            raise ArgumentError(f"Slices: expected points >= 2 and rollouts >= 1, got {points} and {rollouts}")
         self.points, self.rollouts, self.seed = points, rollouts, seed
         self.simulator = partial(Simulator, dt=dt, substeps=substeps, crossing=crossing)
 
@@ -102,7 +103,7 @@ class Slices(Measurement):
 
     def _slice(self, solution: Solution, plane: Plane) -> Slice:
         section = Section.of(solution, plane, self.points)
-        simulator, noise = self.simulator(solution.problem), generator_like(solution, self.seed)
+        simulator, noise = self.simulator(solution.problem), rng_like(solution, self.seed)
         mean = mean_payoff(simulator, solution.policy, section.tau, section.x, self.rollouts, noise)
         shape = (self.points, self.points)
         return Slice(section, mean.cpu().reshape(shape), projected_field(solution, section).cpu().reshape(*shape, 2))

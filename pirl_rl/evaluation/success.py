@@ -9,11 +9,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from pirl_rl.evaluation.evidence import points_generator
+from pirl_rl.errors import ArgumentError
+from pirl_rl.evaluation.evidence import points_rng
 from pirl_rl.evaluation.monte_carlo import Policy, mean_payoff, wilson_interval
-from pirl_rl.initial_states import InitialStates, UniformStates
 from pirl_rl.payoffs import Indicator
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.sampling.initial_states import InitialStates, UniformStates
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
@@ -40,17 +41,17 @@ class Success:
         seed: int = 0,
     ):
         if episodes < 1:
-            raise ValueError(f"Success: expected episodes >= 1, got {episodes}")
+            raise ArgumentError(f"Success: expected episodes >= 1, got {episodes}")
         self.episodes, self.seed, self.initial_states = episodes, seed, initial_states or UniformStates()
         self.simulator = partial(Simulator, dt=dt, substeps=substeps, crossing=crossing)
 
     def __call__(self, solution: Solution) -> dict[str, float]:
         """success_rate with its 95% interval (success_low, success_high), reward, value_spread, and if known
         optimal_reward."""
-        problem, generator = solution.problem, points_generator(self.seed)
+        problem, rng = solution.problem, points_rng(self.seed)
         dt = self.simulator(problem).dt
         max_steps = round(problem.horizon / dt)
-        steps, x = self.initial_states.sample(problem, self.episodes, max_steps, generator, solution.dtype)
+        steps, x = self.initial_states.sample(problem, self.episodes, max_steps, rng, solution.dtype)
         tau, x = (steps * dt).to(solution.device, solution.dtype), x.to(solution.device)
         reward = rate = self._mean(problem, solution.policy, tau, x)
         if problem.payoff.epsilon > 0:
@@ -71,5 +72,5 @@ class Success:
         return metrics
 
     def _mean(self, problem: ReachAvoidProblem, policy: Policy, tau: Tensor, x: Tensor) -> float:
-        generator = torch.Generator(x.device).manual_seed(self.seed)
-        return mean_payoff(self.simulator(problem), policy, tau, x, 1, generator).mean().item()
+        rng = torch.Generator(x.device).manual_seed(self.seed)
+        return mean_payoff(self.simulator(problem), policy, tau, x, 1, rng).mean().item()

@@ -25,16 +25,14 @@ class Trajectories:
 
 
 @torch.no_grad()
-def closed_loop(
-    simulator: Simulator, policy: Policy, tau: Tensor, x: Tensor, generator: torch.Generator
-) -> Trajectories:
+def closed_loop(simulator: Simulator, policy: Policy, tau: Tensor, x: Tensor, rng: torch.Generator) -> Trajectories:
     """Simulate one path from each (tau, x), (N,) and (N, n), until it reaches A or B or its time, rounded to whole
     control steps, is over."""
     problem, left = simulator.problem, torch.round(tau.double() / simulator.dt).long()
     reached, failed, steps = problem.reached(x), problem.failed(x), torch.zeros_like(left)
     times, states = [tau], [x]
     for _ in range(int(left.max())):
-        step = simulator.step(x, policy((left * simulator.dt).to(x), x).to(x.dtype), generator)
+        step = simulator.step(x, policy((left * simulator.dt).to(x), x).to(x.dtype), rng)
         active = ~(reached | failed) & (left > 0)
         x = torch.where(active.unsqueeze(-1), step.state, x)
         reached, failed = reached | (active & step.reached), failed | (active & step.failed)

@@ -14,14 +14,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pirl_rl import checkpoint
-from pirl_rl.configuration import ConfigError
-from pirl_rl.console import INTERRUPTED
+from pirl_rl.commands.console import INTERRUPTED
+from pirl_rl.errors import ConfigError
 from pirl_rl.files import replacing
 from pirl_rl.outer_loop.history import Result
 from pirl_rl.outer_loop.plan import Candidate
 from pirl_rl.outer_loop.processes import Job
 from pirl_rl.outer_loop.redaction import redact
-from pirl_rl.runs import refuse_links
+from pirl_rl.runs.load import refuse_links
 from pirl_rl.schedules import LossSchedule
 
 SUMMARY, FAILED = "summary.json", "failed.json"

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from pirl_rl.configuration import ConfigError
-from pirl_rl.runs import refuse_links
+from pirl_rl.errors import ConfigError
+from pirl_rl.runs.load import refuse_links
 
 KEPT = "tune.yaml"
 """The settings that a loop began with."""

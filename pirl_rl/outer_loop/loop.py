@@ -9,13 +9,13 @@ from pathlib import Path
 
 from jinja2 import TemplateError
 
-from pirl_rl.configuration import ConfigError
+from pirl_rl.errors import ConfigError, PlanError
 from pirl_rl.outer_loop import prompt
 from pirl_rl.outer_loop.advisors import Advisor, Request
 from pirl_rl.outer_loop.advisors.greedy import Greedy
 from pirl_rl.outer_loop.candidates import LEADING, Task, job, overrides, result, settle
 from pirl_rl.outer_loop.history import History, Result, Round
-from pirl_rl.outer_loop.parsing import PlanError, parse_plan
+from pirl_rl.outer_loop.parsing import parse_plan
 from pirl_rl.outer_loop.plan import START, Plan
 from pirl_rl.outer_loop.processes import Job, Launcher
 from pirl_rl.outer_loop.record import Attempt, Record

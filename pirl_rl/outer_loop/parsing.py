@@ -8,23 +8,15 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
 
 from pydantic import ValidationError
 
+from pirl_rl.errors import PlanError
 from pirl_rl.outer_loop.history import History
 from pirl_rl.outer_loop.plan import START, Plan
 
 MAX_ANSWER = 200_000
 """Characters of the longest answer that is read."""
-
-
-class PlanError(ValueError):
-    """An answer that is no plan; `errors` says what is wrong, one line each."""
-
-    def __init__(self, errors: Sequence[str]):
-        super().__init__("; ".join(errors))
-        self.errors = list(errors)
 
 
 def parse_plan(answer: str, history: History, count: int) -> Plan:

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from pirl_rl.configuration import ConfigError
+from pirl_rl.errors import ConfigError
 from pirl_rl.files import replacing
 from pirl_rl.outer_loop.history import History, Result, Round
 from pirl_rl.outer_loop.plan import Plan

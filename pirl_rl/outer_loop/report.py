@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from pirl_rl.figures.run import save_figures
 from pirl_rl.files import replacing
 from pirl_rl.outer_loop.history import History, Result
 from pirl_rl.outer_loop.tree import best_path, draw_tree, node, nodes, status, weights
-from pirl_rl.plots import save_figures
 
 
 def line(result: Result, history: History) -> str:

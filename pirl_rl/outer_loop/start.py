@@ -11,12 +11,13 @@ from pydantic import ValidationError
 
 from pirl_rl import checkpoint
 from pirl_rl.assembly import make_trainer
-from pirl_rl.collocation import ReplayCollocation
-from pirl_rl.configuration import ConfigError, load_config
+from pirl_rl.configuration import load_config
+from pirl_rl.errors import ConfigError
 from pirl_rl.evaluation import evaluate
 from pirl_rl.outer_loop.candidates import JUDGED
 from pirl_rl.outer_loop.history import Result
 from pirl_rl.outer_loop.plan import START
+from pirl_rl.sampling.collocation import ReplayCollocation
 from pirl_rl.trainer import Trainer
 
 

@@ -1,7 +1,10 @@
-"""Problems shipped with the package, one file each."""
+"""Problems shipped with the package, one file each, or one folder where a problem brings more than its physics.
 
-from pirl_rl.problems.drift import VehicleDrift
-from pirl_rl.problems.drift3 import VehicleDrift3
+They are extensions like a user's own: a configuration names them, and no general module of the package imports them.
+"""
+
+from pirl_rl.problems.drift.problem import VehicleDrift
+from pirl_rl.problems.drift.three_state import VehicleDrift3
 from pirl_rl.problems.reach1d import Reach1D
 from pirl_rl.problems.safety1d import Safety1D
 

@@ -10,10 +10,6 @@ from typing import Protocol
 from pirl_rl.outer_loop.history import History
 
 
-class AdvisorError(RuntimeError):
-    """An advisor gave no answer; the message says why and holds no key."""
-
-
 @dataclass(frozen=True)
 class Request:
     """What a round asks.

@@ -7,7 +7,7 @@ import os
 import stat
 from pathlib import Path
 
-from pirl_rl.outer_loop.advisors import AdvisorError
+from pirl_rl.errors import AdvisorError
 from pirl_rl.outer_loop.parsing import MAX_ANSWER
 
 

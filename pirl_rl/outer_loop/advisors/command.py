@@ -14,7 +14,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO
 
-from pirl_rl.outer_loop.advisors import AdvisorError, Request
+from pirl_rl.errors import AdvisorError, ArgumentError
+from pirl_rl.outer_loop.advisors import Request
 from pirl_rl.outer_loop.advisors.answer import one_line, read_answer
 from pirl_rl.outer_loop.prompt import asked
 from pirl_rl.outer_loop.redaction import redact
@@ -39,14 +40,14 @@ class Command:
         try:
             self.arguments = shlex.split(command)
         except ValueError as error:
-            raise ValueError(f"command: expected a program and its arguments, got {command!r} ({error})") from None
+            raise ArgumentError(f"command: expected a program and its arguments, got {command!r} ({error})") from None
         if not any("{plan}" in argument for argument in self.arguments):
-            raise ValueError(f"command: expected {{plan}}, the file that the program is to write, in {command!r}")
+            raise ArgumentError(f"command: expected {{plan}}, the file that the program is to write, in {command!r}")
         program = shutil.which(self.arguments[0])
         if program is None:
-            raise ValueError(f"command: there is no program {self.arguments[0]}")
+            raise ArgumentError(f"command: there is no program {self.arguments[0]}")
         if not timeout > 0:
-            raise ValueError(f"timeout: expected seconds > 0, got {timeout}")
+            raise ArgumentError(f"timeout: expected seconds > 0, got {timeout}")
         self.arguments[0], self.timeout = str(Path(program).absolute()), timeout
 
     def propose(self, request: Request) -> str:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from pirl_rl.outer_loop.advisors import AdvisorError, Request
+from pirl_rl.errors import AdvisorError, ArgumentError
+from pirl_rl.outer_loop.advisors import Request
 from pirl_rl.outer_loop.advisors.answer import read_answer
 from pirl_rl.outer_loop.parsing import MAX_ANSWER
 
@@ -23,7 +24,7 @@ class File:
     def __init__(self, path: str):
         self.path = Path(path).absolute()
         if not self.path.exists():
-            raise ValueError(f"path: expected a file with plans or a loop's directory, got {path}")
+            raise ArgumentError(f"path: expected a file with plans or a loop's directory, got {path}")
 
     def propose(self, request: Request) -> str:
         if self.path.is_dir():

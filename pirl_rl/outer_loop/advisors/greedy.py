@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pirl_rl.errors import ArgumentError
 from pirl_rl.outer_loop.advisors import Request
 from pirl_rl.outer_loop.advisors.continuation import rounded, sigmoid, starts
 from pirl_rl.outer_loop.history import History, Result
@@ -37,9 +38,11 @@ class Greedy:
 
     def __init__(self, growth: float = 2.0, jitter_growth: float = 1.25, most_jitter: float = 0.1):
         if not 1 < growth <= 10 or not 1 < jitter_growth <= 10:
-            raise ValueError(f"growth and jitter_growth: expected 1 < factor <= 10, got {growth} and {jitter_growth}")
+            raise ArgumentError(
+                f"growth and jitter_growth: expected 1 < factor <= 10, got {growth} and {jitter_growth}"
+            )
         if not 0 <= most_jitter <= 1:
-            raise ValueError(f"most_jitter: expected a number from 0 to 1, got {most_jitter}")
+            raise ArgumentError(f"most_jitter: expected a number from 0 to 1, got {most_jitter}")
         self.growth, self.jitter_growth, self.most_jitter = growth, jitter_growth, most_jitter
 
     def propose(self, request: Request) -> str:

@@ -9,7 +9,8 @@ import os
 import time
 from typing import Any
 
-from pirl_rl.outer_loop.advisors import AdvisorError, Request
+from pirl_rl.errors import AdvisorError, ArgumentError
+from pirl_rl.outer_loop.advisors import Request
 from pirl_rl.outer_loop.advisors.answer import one_line
 from pirl_rl.outer_loop.prompt import asked
 from pirl_rl.outer_loop.redaction import REMOVED, SHORTEST
@@ -64,7 +65,7 @@ class OpenAI:
         temperature: float | None = None,
     ):
         if not timeout > 0 or retries < 0:
-            raise ValueError(f"expected timeout > 0 and retries >= 0, got {timeout} and {retries}")
+            raise ArgumentError(f"expected timeout > 0 and retries >= 0, got {timeout} and {retries}")
         self.url = _endpoint(base_url)
         self.model, self.key_variable, self.temperature = model, key_variable, temperature
         self.timeout, self.retries = timeout, retries
@@ -84,7 +85,7 @@ class OpenAI:
         key = os.environ.get(self.key_variable, "").strip()
         if not key or not key.isascii() or not key.isprintable() or " " in key:
             state = "is not set" if not key else "holds characters that no key has"
-            raise ValueError(f"key_variable: expected the key in the environment, but {self.key_variable} {state}")
+            raise ArgumentError(f"key_variable: expected the key in the environment, but {self.key_variable} {state}")
         return key
 
     def _ask(self, text: str, key: str) -> str:
@@ -135,7 +136,9 @@ def _endpoint(base_url: str) -> str:
     except httpx.InvalidURL:
         url = httpx.URL("")
     if url.scheme not in ("http", "https") or not url.host or url.userinfo or url.query or url.fragment:
-        raise ValueError("base_url: expected http(s)://host[:port]/path without user, password or query, got another")
+        raise ArgumentError(
+            "base_url: expected http(s)://host[:port]/path without user, password or query, got another"
+        )
     return f"{base_url.rstrip('/')}/chat/completions"
 
 

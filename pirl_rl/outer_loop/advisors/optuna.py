@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from pirl_rl.errors import ArgumentError
 from pirl_rl.outer_loop.advisors import Request
 from pirl_rl.outer_loop.advisors.continuation import rounded, sigmoid, starts
 from pirl_rl.outer_loop.history import History, Result
@@ -48,13 +49,13 @@ class Optuna:
         jitter: float = 0.1,
     ):
         if sampler not in ("tpe", "random"):
-            raise ValueError(f"sampler: expected 'tpe' or 'random', got {sampler!r}")
+            raise ArgumentError(f"sampler: expected 'tpe' or 'random', got {sampler!r}")
         if seed < 0 or startup < 1:
-            raise ValueError(f"expected seed >= 0 and startup >= 1, got {seed} and {startup}")
+            raise ArgumentError(f"expected seed >= 0 and startup >= 1, got {seed} and {startup}")
         if len(weights) != 2 or not 0 < weights[0] < weights[1] <= 1e3:
-            raise ValueError(f"weights: expected [least, largest], 0 < least < largest <= 1000, got {list(weights)}")
+            raise ArgumentError(f"weights: expected [least, largest], 0 < least < largest <= 1000, got {list(weights)}")
         if not 0 < jitter <= 1:
-            raise ValueError(f"jitter: expected 0 < jitter <= 1, got {jitter}")
+            raise ArgumentError(f"jitter: expected 0 < jitter <= 1, got {jitter}")
         self.sampler, self.seed, self.startup = sampler, seed, startup
         low, high = (math.log10(weight) for weight in weights)
         self.space = {

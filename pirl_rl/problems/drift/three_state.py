@@ -15,9 +15,9 @@ from torch import Tensor
 
 from pirl_rl.payoffs import Payoff
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.problems import vehicle
-from pirl_rl.problems.drift import VehicleDrift
-from pirl_rl.problems.equilibria import DEGREE, SPEED
+from pirl_rl.problems.drift import vehicle
+from pirl_rl.problems.drift.equilibria import DEGREE, SPEED
+from pirl_rl.problems.drift.problem import VehicleDrift
 from pirl_rl.sets import Box, Plane, band
 
 STEERING = -12 * DEGREE  # rad, delta of the published equilibrium

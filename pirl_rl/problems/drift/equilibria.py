@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import root
 from torch import Tensor
 
-from pirl_rl.problems.vehicle import accelerations
+from pirl_rl.problems.drift.vehicle import accelerations
 
 DEGREE = math.pi / 180
 SPEED = 8.0  # m/s, v_x of the equilibria

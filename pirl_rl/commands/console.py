@@ -14,13 +14,8 @@ from hydra.errors import CompactHydraException, HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from pirl_rl.checkpoint import CheckpointError
-from pirl_rl.collectors import CollectorError
-from pirl_rl.configuration import ConfigError
+from pirl_rl.errors import CheckpointError, CollectorError, ConfigError, DivergenceError, Interrupted, ProblemError
 from pirl_rl.evaluation import METRICS
-from pirl_rl.learner import DivergenceError
-from pirl_rl.problem import ProblemError
-from pirl_rl.trainer import Interrupted
 
 EXPECTED = (
     ConfigError,

@@ -10,10 +10,10 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
+from pirl_rl.errors import CheckpointError, ConfigError
 from pirl_rl import checkpoint
 from pirl_rl.assembly import fitting, make_loss
-from pirl_rl.checkpoint import CheckpointError
-from pirl_rl.configuration import ConfigError, build, load_config
+from pirl_rl.configuration import build, load_config
 from pirl_rl.evaluation.trajectories import Trajectories, closed_loop
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution

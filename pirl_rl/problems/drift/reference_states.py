@@ -8,12 +8,12 @@ import torch
 
 from pirl_rl.evaluation.monte_carlo import Policy
 from pirl_rl.evaluation.reference_states import ReferenceStates, visited_by
-from pirl_rl.initial_states import EquilibriumStates
 from pirl_rl.problems import VehicleDrift
+from pirl_rl.problems.drift.starts import EquilibriumStates
 from pirl_rl.sets import Box
 from pirl_rl.simulator import Simulator
 
-FILE = Path(__file__).with_name("drift_states.npz")
+FILE = Path(__file__).with_name("reference_states.npz")
 NETWORK_BOX = Box([0, -2, -0.8, 3, -12, -2.5, -0.7, 0.25], [5, 2, 0.8, 25, 12, 2.5, 0.7, 1.05])
 """Of (tau, x): the [-1, 1] coordinates of the paper's networks, wider than `VehicleDrift.states`."""
 EPISODES = 1_024
@@ -22,10 +22,10 @@ EPISODES = 1_024
 def drift_states(policy: Policy, seed: int = 0) -> ReferenceStates:
     """The paper's recipe for any policy: 1,024 noise-free episodes from the paper's full-scale training starts, steps
     to go random, the paper's simulator (Euler steps of 0.1 s, exits at end points)."""
-    problem, generator = VehicleDrift(), torch.Generator().manual_seed(seed)
+    problem, rng = VehicleDrift(), torch.Generator().manual_seed(seed)
     simulator = Simulator(problem, dt=0.1, substeps=1, crossing="endpoint")
-    tau, x = visited_by(simulator, policy, EquilibriumStates(), EPISODES, generator)
-    return ReferenceStates.from_visited(problem, tau, x, NETWORK_BOX, generator)
+    tau, x = visited_by(simulator, policy, EquilibriumStates(), EPISODES, rng)
+    return ReferenceStates.from_visited(problem, tau, x, NETWORK_BOX, rng)
 
 
 class DriftStates:
@@ -48,7 +48,7 @@ class DriftStates:
             return ReferenceStates.load(FILE)
         # Runs build evaluators, this one among them.
         from pirl_rl.configuration import ConfigError
-        from pirl_rl.runs import load_run
+        from pirl_rl.runs.load import load_run
 
         reference = load_run(self.run)
         if type(reference.problem) is not VehicleDrift:

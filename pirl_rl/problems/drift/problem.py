@@ -14,8 +14,8 @@ from torch import Tensor
 
 from pirl_rl.payoffs import Payoff
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.problems import vehicle
-from pirl_rl.problems.equilibria import CURVATURE, DEGREE, FRICTION_BAND, SPEED, EquilibriumCurves
+from pirl_rl.problems.drift import vehicle
+from pirl_rl.problems.drift.equilibria import CURVATURE, DEGREE, FRICTION_BAND, SPEED, EquilibriumCurves
 from pirl_rl.sets import Box, Plane, band
 
 FRICTION_RANGE = (0.25, 1.05)
@@ -119,16 +119,16 @@ class VehicleDrift(ReachAvoidProblem):
         ]
         return torch.stack(rows).movedim(0, -1)
 
-    def faces(self, count: int, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+    def faces(self, count: int, rng: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         """Half of the points on the target's faces, half on those of the avoid set, at friction inside the band.
 
         Only where all vertex controls drive the car into the set: there V is continuous. Where it can leave a face, V
         jumps within a layer of less than a centimetre or its like, since the noise is weak: data there would teach a
         network that cannot see the layer the wrong value of its surroundings.
         """
-        target = _drawn(lambda n: self._target_faces(n, generator), lambda x: self._enters(x, self.reached), count // 2)
+        target = _drawn(lambda n: self._target_faces(n, rng), lambda x: self._enters(x, self.reached), count // 2)
         rest = count - count // 2
-        avoid = _drawn(lambda n: self._avoid_faces(n, generator), lambda x: self._enters(x, self.failed), rest)
+        avoid = _drawn(lambda n: self._avoid_faces(n, rng), lambda x: self._enters(x, self.failed), rest)
         value = torch.cat([torch.ones(len(target)), torch.zeros(len(avoid))]).to(target)
         return torch.cat([target, avoid]), value
 
@@ -155,10 +155,10 @@ class VehicleDrift(ReachAvoidProblem):
             ),
         }
 
-    def _target_faces(self, count: int, generator: torch.Generator | None) -> Tensor:
+    def _target_faces(self, count: int, rng: torch.Generator | None) -> Tensor:
         """Points of the target with one of its six bounded coordinates at its bound."""
-        unit = 2 * torch.rand(count, 7, generator=generator, dtype=torch.float64) - 1
-        side = torch.randint(6, (count,), generator=generator)
+        unit = 2 * torch.rand(count, 7, generator=rng, dtype=torch.float64) - 1
+        side = torch.randint(6, (count,), generator=rng)
         rows = torch.arange(count)
         unit[rows, side] = unit[rows, side].sign()
         low, high = self.friction_band
@@ -169,11 +169,11 @@ class VehicleDrift(ReachAvoidProblem):
         columns = [offset[:, 0], offset[:, 1] - sideslip, v_x, v_x * (sideslip + offset[:, 3]).tan()]
         return torch.stack([*columns, yaw + offset[:, 4], steering + offset[:, 5], friction], -1)
 
-    def _avoid_faces(self, count: int, generator: torch.Generator | None) -> Tensor:
+    def _avoid_faces(self, count: int, rng: torch.Generator | None) -> Tensor:
         """Points of the envelope with one bound met; bounds outside `states` are left out."""
-        x = self.states.sample(count, generator, dtype=torch.float64)
-        side = torch.randint(5, (count,), generator=generator)
-        sign = torch.where(torch.rand(count, generator=generator, dtype=torch.float64) < 0.5, -1.0, 1.0).double()
+        x = self.states.sample(count, rng, dtype=torch.float64)
+        side = torch.randint(5, (count,), generator=rng)
+        sign = torch.where(torch.rand(count, generator=rng, dtype=torch.float64) < 0.5, -1.0, 1.0).double()
         for index, (column, name) in enumerate(((0, "e_y"), (1, "e_psi"), (4, "r"))):
             x[:, column] = torch.where(side == index, sign * self.limits[name], x[:, column])
         x[:, 2] = torch.where(side == 3, torch.full_like(sign, self.speeds[0]), x[:, 2])

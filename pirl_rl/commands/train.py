@@ -1,0 +1,104 @@
+"""Train: `python -m pirl_rl.train +experiment=reach1d [method=...] [start=CHECKPOINT] [key=value ...]`, or
+`resume=RUN_DIR`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+
+from pirl_rl import checkpoint
+from pirl_rl.assembly import begin, make_trainer, restore
+from pirl_rl.commands.console import INTERRUPTED, named_modules, override, quiet_libraries, table, told
+from pirl_rl.configuration import CONF, load_config, save_config
+from pirl_rl.errors import ConfigError
+from pirl_rl.figures.run import FIGURES, draw_run
+from pirl_rl.loggers import METRICS_FILE
+from pirl_rl.runs.load import refuse_links
+from pirl_rl.trainer import Trainer
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")
+def train(config: DictConfig) -> float:
+    """A new run in Hydra's run directory; returns the metric that a sweep may minimise."""
+    hydra_config = HydraConfig.get()
+    folder = Path(hydra_config.runtime.output_dir)
+    with told(folder, one_of_many=hydra_config.mode == RunMode.MULTIRUN), _new(folder):
+        # What the user types is trusted; what a directory from elsewhere says is not.
+        trust = [*config.trust, *named_modules(hydra_config.overrides.task)]
+        trainer = make_trainer(config, folder, trust)
+        if config.start is not None:
+            # On record as a file wherever one stands: what was typed may be relative, or a run that goes on.
+            if not isinstance(config.start, str):
+                raise ConfigError(f"start: expected the path of a run or a checkpoint, got {config.start!r}")
+            config.start = str(begin(trainer, config.start))
+        save_config(config, folder)
+        OmegaConf.save(hydra_config.overrides.task, folder / ".hydra" / "overrides.yaml")
+        summary = _train(trainer)
+    return summary.get("value_mse", summary.get("hjb_sup_loss", float("nan")))
+
+
+def resume(folder: Path, overrides: Sequence[str]) -> None:
+    """Go on in a run directory, with plain `key=value` overrides of its configuration, which keeps them."""
+    with told(folder):
+        config = load_config(folder)
+        refuse_links(folder)
+        config.trust = []
+        for text in overrides:
+            if text.startswith("start="):
+                raise ConfigError(f"{text}: the run has begun already; a new run starts from there, without resume")
+            override(config, text)
+        trainer = make_trainer(config, folder, [*config.trust, *named_modules(overrides)])
+        restore(trainer)
+        save_config(config, folder)
+        _train(trainer)
+
+
+def _train(trainer: Trainer) -> dict[str, float]:
+    summary = trainer.train()
+    folder = trainer.folder
+    assert folder is not None
+    print(table(summary))
+    for figure in draw_run(trainer.solution, folder / METRICS_FILE, folder / FIGURES, trainer.final):
+        print(f"figure   {figure}")
+    print(f"run      {folder}")
+    return summary
+
+
+@contextlib.contextmanager
+def _new(folder: Path) -> Iterator[None]:
+    """Nothing is overwritten, and a run that ends before its first row or checkpoint leaves nothing behind."""
+    if any(folder.iterdir()):
+        raise ConfigError(f"hydra.run.dir: {folder} is not empty, and a run never overwrites anything")
+    try:
+        yield
+    except BaseException:
+        if not (folder / METRICS_FILE).exists() and not (folder / checkpoint.FOLDER).exists():
+            shutil.rmtree(folder)
+            for parent in (folder.parent, folder.parent.parent):
+                with contextlib.suppress(OSError):
+                    parent.rmdir()  # empty ones only
+        raise
+
+
+def main() -> None:
+    quiet_libraries()
+    arguments = sys.argv[1:]
+    resumed = [item for item in arguments if item.startswith("resume=") and item != "resume=null"]
+    try:
+        if resumed:
+            folder = Path(resumed[-1].partition("=")[2])
+            resume(folder, [item for item in arguments if item not in resumed])
+        else:
+            train()
+    except KeyboardInterrupt:
+        print("stopped at once; what the last checkpoint holds is kept", file=sys.stderr)
+        sys.exit(INTERRUPTED)

@@ -1,0 +1,235 @@
+"""Tune: `python -m pirl_rl.tune +experiment=drift start=RUN [advisor=NAME] [rounds=3] [candidates=2] [out=DIR] ...`.
+
+Rounds of continuations, each planned by an advisor. Started again with the same `out` it goes on where it was; with
+`--report out=DIR` it only draws what there is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import hydra
+from hydra import compose
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+
+from pirl_rl.assembly import begin, make_trainer
+from pirl_rl.commands.console import INTERRUPTED, named_modules, quiet_libraries, told
+from pirl_rl.configuration import CONF, build, convert
+from pirl_rl.errors import ConfigError
+from pirl_rl.files import replacing
+from pirl_rl.outer_loop.candidates import LEADING, Task, overrides, quoted
+from pirl_rl.outer_loop.directory import KEPT, check, locked
+from pirl_rl.outer_loop.history import Result
+from pirl_rl.outer_loop.loop import Loop, Settings
+from pirl_rl.outer_loop.plan import START, Candidate
+from pirl_rl.outer_loop.processes import Processes
+from pirl_rl.outer_loop.record import Record
+from pirl_rl.outer_loop.redaction import redact
+from pirl_rl.outer_loop.report import markdown, write_report
+from pirl_rl.outer_loop.start import measure, tolerance
+from pirl_rl.runs.load import refuse_links
+from pirl_rl.trainer import Trainer
+
+COUNTS = {"rounds": 1, "extra_rounds": 0, "candidates": 1, "updates": 1, "parallel": 1}
+"""The loop's numbers and the least of each."""
+
+OWN = ("start", "out", "advisor", *COUNTS)
+"""Settings of the loop itself; all others are those of its candidates."""
+
+PLANNED = ("schedule", "stages", "resume", "trainer.updates", "evaluation.final")
+"""Settings that the loop gives to its candidates."""
+
+EVALUATIONS = 10
+"""Of a candidate, at least: the guard, which stops one that collapses, sees nothing between them."""
+
+JUDGES = ("success", "residuals", "calibration")
+"""Evaluators of baseline and candidates."""
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF), config_name="tune")
+def tune(config: DictConfig) -> None:
+    """A loop in `out`, from its beginning or from where it was."""
+    typed = HydraConfig.get().overrides.task
+    out = Path(HydraConfig.get().runtime.output_dir)
+    with told(out), _tidy(out), _resumable(out):
+        counts = {name: _count(config, name) for name in COUNTS}
+        train = [*_for_training(typed), *_often_enough(config)]
+        trust = [*config.trust, *named_modules(typed)]
+        advisor = build(config.advisor, "advisor", trust)
+        trainer, path, final = _first(config, train, trust)
+        config.start = str(path)
+        kept = redact(OmegaConf.to_container(config, resolve=True))
+        check(out, kept)
+        with locked(out) as lock:
+            check(out, kept)
+            if not (out / KEPT).exists():
+                with replacing(out / KEPT) as file:
+                    file.write(OmegaConf.to_yaml(OmegaConf.create(kept)))
+            record = Record(out)
+            baseline = record.baseline()
+            if baseline is None:
+                print(f"baseline: evaluating {path}", flush=True)
+                baseline = measure(trainer, path, trust)
+                record.write_baseline(baseline)
+            del trainer  # its memory is the candidates'
+            parallel = counts.pop("parallel")
+            settings = Settings(**counts, start=path, train=train, trust=trust, final=final, seed=config.seed)
+            loop = Loop(settings, record, advisor, Processes(parallel, [lock]))
+            loop.run(record.history(baseline, tolerance(baseline)))
+            _report(out, path)
+
+
+def report(out: Path) -> None:
+    """Draw what there is of a loop, finished or not."""
+    with told(out):
+        refuse_links(out)
+        if not (out / KEPT).is_file():
+            raise ConfigError(f"out: {out} is no loop's directory, expected {KEPT} in it")
+        settings = OmegaConf.to_container(OmegaConf.load(out / KEPT), resolve=False)
+        _report(out, Path(str(settings["start"])))  # type: ignore[index, call-overload]
+
+
+def _report(out: Path, start: Path) -> None:
+    record = Record(out)
+    baseline = record.baseline()
+    if baseline is None:
+        raise ConfigError(f"out: {out} has no baseline yet")
+    history = record.history(baseline, tolerance(baseline))
+    print(f"\n{markdown(history)}")
+    for path in write_report(history, out):
+        print(f"written  {path}")
+    best = history.best
+    print(f"best     {start if best.candidate is None else record.run(str(best.checkpoint))}")
+
+
+def _count(config: DictConfig, name: str) -> int:
+    value = convert(config[name], int, name)
+    if not isinstance(value, int) or value < COUNTS[name]:
+        raise ConfigError(f"{name}: expected an integer >= {COUNTS[name]}, got {value!r}")
+    return value
+
+
+def _for_training(typed: Sequence[str]) -> list[str]:
+    """Those of the typed overrides that every candidate's training gets.
+
+    Raises:
+        ConfigError: one of what the plans decide.
+    """
+    parser, kept = OverridesParser.create(), []
+    for text in typed:
+        key = parser.parse_override(text).key_or_group
+        if any(_within(key, name) for name in PLANNED):
+            raise ConfigError(f"{text}: expected no {key} here, the loop sets it for every candidate")
+        if not any(_within(key, name) for name in OWN):
+            kept.append(text)
+    return kept
+
+
+def _often_enough(config: DictConfig) -> list[str]:
+    """An experiment made for longer runs is evaluated more often here."""
+    every, most = config.trainer.evaluate_every, max(1, config.updates // EVALUATIONS)
+    return [f"trainer.evaluate_every={most}"] if isinstance(every, int) and every > most else []
+
+
+def _within(key: str, name: str) -> bool:
+    return key == name or key.startswith(f"{name}.")
+
+
+def _first(config: DictConfig, train: Sequence[str], trust: Sequence[str]) -> tuple[Trainer, Path, list[str]]:
+    """A candidate's trainer with the start's networks, the start's file, and the names of the evaluators.
+
+    Raises:
+        ConfigError, CheckpointError: whatever would end every candidate at once.
+    """
+    start = convert(config.start, str, "start") if config.start is not None else None
+    if not start:
+        raise ConfigError(f"start: expected a run directory or a file in its checkpoints/, got {start}")
+    final = [name for name in JUDGES if isinstance(config.evaluation.get(name), DictConfig)]
+    if not {"success", "calibration"} <= {*final}:
+        raise ConfigError(f"evaluation: expected success and calibration, to judge candidates by, got {final}")
+    candidate = compose("train", [*LEADING, *train, *overrides(_example(config, Path(start)), final, config.seed)])
+    trainer = make_trainer(candidate, None, trust)
+    return trainer, begin(trainer, start), final
+
+
+def _example(config: DictConfig, start: Path) -> Task:
+    """A candidate that no plan has, with every loss in force."""
+    ones = (1.0, 1.0, 1.0)
+    plan = Candidate(
+        name="any", schedule_initial=ones, schedule_final=ones, schedule_center=0.0, schedule_sharpness=1.0
+    )
+    return Task("any", start, plan, Result(checkpoint=START, weights=ones), start, config.updates)
+
+
+@contextlib.contextmanager
+def _tidy(out: Path) -> Iterator[None]:
+    """A loop that ends before it wrote anything leaves no directory behind."""
+    try:
+        yield
+    finally:
+        if not any(out.iterdir()):
+            for folder in (out, out.parent, out.parent.parent):
+                with contextlib.suppress(OSError):
+                    folder.rmdir()  # empty ones only
+
+
+@contextlib.contextmanager
+def _resumable(out: Path) -> Iterator[None]:
+    """Ctrl-C and SIGTERM stop the loop and its candidates, and say how it goes on."""
+
+    def stop(number, frame):
+        raise KeyboardInterrupt
+
+    previous = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    except KeyboardInterrupt as reason:
+        again = [*(text for text in sys.argv[1:] if not text.startswith("out=")), f"out={quoted(out)}"]
+        print(
+            f"{str(reason) or 'stopped'}; go on with: python -m pirl_rl.tune {shlex.join(again)}",
+            file=sys.stderr,
+            flush=True,
+        )
+        raise SystemExit(INTERRUPTED) from None
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+
+
+def _readable(argument: str) -> str:
+    """The line of `advisor.command`, whose quotes a shell has taken away, as Hydra reads it: in quotes."""
+    key, _, line = argument.partition("=")
+    if key.lstrip("+") != "advisor.command":
+        return argument
+    try:
+        OverridesParser.create().parse_override(argument)
+    except HydraException:
+        return f"{key}={quoted(line)}"
+    return argument
+
+
+def main() -> None:
+    sys.argv[1:] = arguments = [_readable(text) for text in sys.argv[1:]]
+    quiet_libraries()
+    if "--report" in arguments:
+        named = [item.partition("=")[2] for item in arguments if item.startswith("out=")]
+        named += [item for item in arguments if not item.startswith(("-", "out="))]
+        with told(Path()):
+            if len(named) != 1:
+                raise ConfigError("--report: expected out=DIR, the directory of one loop")
+        report(Path(named[0]))
+        return
+    with told(Path()):
+        if {"-m", "--multirun"} & {*arguments}:
+            raise ConfigError("-m: a loop runs its candidates itself, expected candidates=... and parallel=... instead")
+    try:
+        tune()
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)

@@ -1,0 +1,180 @@
+"""A sweep: table and figure of a metric over the settings of a multirun.
+
+python -m pirl_rl.sweeps DIR [--metric value_mse] [--axes KEY [KEY]] [--out FOLDER]
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import yaml
+from matplotlib.figure import Figure
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from pirl_rl.errors import RunError
+from pirl_rl.runs.compare import number, read_run
+from pirl_rl.figures.sweep import draw_grid, draw_line
+from pirl_rl.figures.run import save_figures
+
+OVERRIDES = Path(".hydra") / "overrides.yaml"
+AVERAGED = "seed"
+UNSET = "default"
+"""Stands for the value of a setting in the runs in which it was not typed."""
+
+
+class Job(NamedTuple):
+    """One run of a sweep: what was typed for it, and its summary.json, empty where it failed or has not ended."""
+
+    settings: dict[str, str]
+    summary: dict[str, float]
+
+
+class Sweep(NamedTuple):
+    """A metric over one or two settings.
+
+    Attributes:
+        metric: a key of summary.json.
+        axes: the settings' names with their values, sorted.
+        cells: the metric of all runs with the same values, NaN of those that failed; combinations without a run are
+            absent.
+    """
+
+    metric: str
+    axes: dict[str, list[str]]
+    cells: dict[tuple[str, ...], list[float]]
+
+    def mean(self, cell: tuple[str, ...]) -> float:
+        """Over the runs that ended; NaN without one."""
+        ended = [value for value in self.cells.get(cell, []) if not math.isnan(value)]
+        return float(np.mean(ended)) if ended else math.nan
+
+    def text(self, cell: tuple[str, ...]) -> str:
+        if cell not in self.cells:
+            return "missing"
+        runs = self.cells[cell]
+        failed = sum(map(math.isnan, runs))
+        if failed == len(runs):
+            return "failed"
+        return number(self.metric, self.mean(cell)) + (f" ({failed} of {len(runs)} failed)" if failed else "")
+
+
+def find_jobs(folder: Path) -> list[Job]:
+    """All runs below a multirun directory.
+
+    Raises:
+        RunError: there is none, or one that cannot be read.
+    """
+    jobs = []
+    for path in sorted(folder.rglob(str(OVERRIDES))):
+        run = path.parents[1]
+        try:
+            typed = OmegaConf.to_container(OmegaConf.load(path))
+        except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException) as error:
+            raise RunError(f"{path} cannot be read: {error}") from error
+        if not isinstance(typed, list):
+            raise RunError(f"{path}: expected a list of overrides, got {type(typed).__name__}")
+        settings = {key.lstrip("+~"): _plain(value) for key, _, value in (str(item).partition("=") for item in typed)}
+        jobs.append(Job(settings, read_run(run).summary if (run / "summary.json").is_file() else {}))
+    if not jobs:
+        raise RunError(f"no runs found below {folder}: expected directories with {OVERRIDES}")
+    return jobs
+
+
+def _plain(value: str) -> str:
+    """One way to write a number: 1e4 and 10000.0 are the same setting."""
+    try:
+        return f"{float(value):g}"
+    except ValueError:
+        return value
+
+
+def gather(jobs: Sequence[Job], metric: str, axes: Sequence[str] = ()) -> Sweep:
+    """Sort runs into the cells of a table; what varies beside the axes is averaged over.
+
+    Args:
+        jobs: the runs.
+        metric: a key of summary.json.
+        axes: one or two settings; default those that vary, the seed excepted.
+
+    Raises:
+        RunError: nothing varies, more than two settings do, or no run has the metric.
+    """
+    known = {name for job in jobs for name in job.summary}
+    if metric not in known:
+        raise RunError(f"metric: expected one of {', '.join(sorted(known)) or '(no run has ended)'}, got {metric}")
+    names = dict.fromkeys(name for job in jobs for name in job.settings)
+    values = {name: sorted({job.settings.get(name, UNSET) for job in jobs}, key=_order) for name in names}
+    varying = [name for name in values if len(values[name]) > 1 and name != AVERAGED]
+    chosen = list(axes) or varying
+    if unknown := [name for name in chosen if name not in values]:
+        raise RunError(f"axes: expected settings out of {', '.join(values)}, got {', '.join(unknown)}")
+    if not 1 <= len(chosen) <= 2:
+        raise RunError(
+            f"axes: expected one or two settings that vary beside the {AVERAGED}, got {len(varying)}"
+            + (f": {', '.join(varying)}; choose with --axes, the others are averaged over" if varying else "")
+        )
+    cells: dict[tuple[str, ...], list[float]] = {}
+    for job in jobs:
+        cell = tuple(job.settings.get(name, UNSET) for name in chosen)
+        cells.setdefault(cell, []).append(float(job.summary.get(metric, math.nan)))
+    return Sweep(metric, {name: values[name] for name in chosen}, cells)
+
+
+def _order(value: str) -> tuple[bool, float, str]:
+    """Numbers by size, then words."""
+    try:
+        return False, float(value), value
+    except ValueError:
+        return True, 0.0, value
+
+
+def table(sweep: Sweep) -> str:
+    """A Markdown table: a row for each value of the first setting, a column for each of the second."""
+    rows, columns = next(iter(sweep.axes)), dict(list(sweep.axes.items())[1:])
+    [(second, values)] = columns.items() or [("", [])]
+    lines = [[f"{sweep.metric}: {rows}" + (f" \\ {second}" if second else ""), *(values or ["mean"])]]
+    lines.append(["---", *["---:"] * (len(lines[0]) - 1)])
+    for value in sweep.axes[rows]:
+        cells = [(value, other) for other in values] or [(value,)]
+        lines.append([value, *map(sweep.text, cells)])
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+
+
+def draw(sweep: Sweep) -> Figure:
+    """A heat map of two settings, a line over one."""
+    if len(sweep.axes) == 1:
+        [(name, values)] = sweep.axes.items()
+        return draw_line(sweep.metric, name, {value: sweep.cells.get((value,), []) for value in values})
+    (row_name, rows), (column_name, columns) = sweep.axes.items()
+    cells = list(itertools.product(rows, columns))
+    shape = (len(rows), len(columns))
+    means = np.array([sweep.mean(cell) for cell in cells]).reshape(shape)
+    texts = np.array([sweep.text(cell).replace(" (", "\n(") for cell in cells]).reshape(shape)
+    return draw_grid(sweep.metric, {row_name: rows, column_name: columns}, means, texts)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="python -m pirl_rl.sweeps", description="Table and heat map of a sweep.")
+    parser.add_argument("folder", metavar="DIR", type=Path, help="a multirun directory")
+    parser.add_argument("--metric", default="value_mse", help="a key of summary.json; default value_mse")
+    parser.add_argument("--axes", nargs="+", default=(), metavar="KEY", help="one or two of the settings that vary")
+    parser.add_argument("--out", metavar="FOLDER", type=Path, help="where sweep.md and sweep.png go; default DIR")
+    options = parser.parse_args(arguments)
+    try:
+        sweep = gather(find_jobs(options.folder), options.metric, options.axes)
+    except RunError as error:
+        parser.error(str(error))
+    out = options.out or options.folder
+    out.mkdir(parents=True, exist_ok=True)
+    text = table(sweep)
+    (out / "sweep.md").write_text(text)
+    [figure] = save_figures({"sweep": draw(sweep)}, out)
+    print(text)
+    print(f"Written: {out / 'sweep.md'}, {figure}")

@@ -1,0 +1,119 @@
+"""The parabolic boundary: points at tau = 0 and on the faces of A and B, with the value V there.
+
+A draw returns a TensorDict of fixed size, so that an update keeps static shapes.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from pirl_rl.errors import ArgumentError, ProblemError
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.sampling.initial_states import sample_interior
+
+FACE_POOL = 16_384
+"""Points on the faces that are found once and drawn from afterwards."""
+
+BISECTIONS = 50
+"""Halvings of a segment between a point inside a set and one outside: enough for double precision."""
+
+
+class BoundarySampler:
+    """Points of the parabolic boundary with the value V there: tau = 0, and the faces of A and B at tau in (0, T].
+
+    Faces come from `problem.faces` where it is given; else from a pool found once by bisection of the level functions
+    between points inside and outside, over a box twice as wide as `states`.
+
+    Args:
+        problem: gives sets and values.
+        initial: points a draw at tau = 0, uniform in `states` outside A and B.
+        faces: points a draw on the faces.
+        widen: the box of the points at tau = 0 is wider than `states` by this factor.
+        tau_power: tau = T U^tau_power on the faces, as in `Collocation`.
+        replay_share: share of the points at tau = 0 that are visited states instead.
+        seed: of the pool.
+
+    Raises:
+        ProblemError: faces that sampling does not find.
+    """
+
+    def __init__(
+        self,
+        problem: ReachAvoidProblem,
+        initial: int = 100,
+        faces: int = 100,
+        widen: float = 1.0,
+        tau_power: float = 1.0,
+        replay_share: float = 0.0,
+        seed: int = 0,
+    ):
+        if initial < 0 or faces < 0 or initial + faces < 1:
+            raise ArgumentError(
+                f"boundary: expected initial, faces >= 0 and one of them > 0, got {initial} and {faces}"
+            )
+        if not widen > 0 or not tau_power > 0:
+            raise ArgumentError(f"boundary: expected widen > 0 and tau_power > 0, got {widen} and {tau_power}")
+        self.problem, self.initial, self.faces, self.tau_power = problem, initial, faces, tau_power
+        if not 0 <= replay_share <= 1:
+            raise ArgumentError(f"boundary.replay_share: expected 0 <= replay_share <= 1, got {replay_share}")
+        self.replay_share, self.box = replay_share, problem.states.expand(widen)
+        rng = torch.Generator().manual_seed(seed)
+        self._pool = _face_pool(problem, rng)
+
+    def sample(self, rng: torch.Generator, replay: TensorDictBase | None = None) -> TensorDict:
+        """{"tau" (N, 1), "state" (N, n), "value" (N,)} with N = initial + faces; `replay` holds the visited states."""
+        device, dtype = rng.device, torch.get_default_dtype()
+        state = sample_interior(self.problem, self.box, self.initial, rng, dtype)
+        visited = 0 if replay is None else round(self.replay_share * self.initial)
+        if replay is not None and visited:
+            index = torch.randint(len(replay), (visited,), generator=rng, device=device)
+            state = torch.cat([replay["state"][index], state[visited:]])
+        value, tau = self.problem.boundary_value(state), torch.zeros(self.initial, 1, device=device)
+        if self.faces:
+            points, values = (entry.to(device) for entry in self._pool)
+            index = torch.randint(len(points), (self.faces,), generator=rng, device=device)
+            late = 1 - torch.rand(self.faces, 1, generator=rng, device=device)
+            tau = torch.cat([tau, self.problem.horizon * late**self.tau_power])
+            state, value = torch.cat([state, points[index]]), torch.cat([value, values[index]])
+        return TensorDict({"tau": tau, "state": state, "value": value}, batch_size=[len(tau)])
+
+
+def _face_pool(problem: ReachAvoidProblem, rng: torch.Generator) -> tuple[Tensor, Tensor]:
+    given = problem.faces(FACE_POOL, rng)
+    if given is not None:
+        points, values = given
+        return points.to(torch.get_default_dtype()), values.to(torch.get_default_dtype())
+    wide = problem.states.expand(2.0)
+    candidates = wide.sample(4 * FACE_POOL, rng, dtype=torch.float64)
+    reached, failed = problem.reached(candidates), problem.failed(candidates)
+    outside = candidates[~(reached | failed)]
+    points, values = [], []
+    for inside, absorbs, value in (
+        (candidates[reached], problem.reached, 1.0),
+        (candidates[failed], problem.failed, 0.0),
+    ):
+        if len(inside) and len(outside):
+            count = FACE_POOL // 2
+            a = inside[torch.randint(len(inside), (count,), generator=rng)]
+            b = outside[torch.randint(len(outside), (count,), generator=rng)]
+            face = _bisect(absorbs, a, b)
+            near = wide.contains(face)
+            points.append(face[near])
+            values.append(torch.full((int(near.sum()),), value))
+    if not points:
+        raise ProblemError(
+            f"{type(problem).__name__}: neither target nor avoid set found among {len(candidates)} points of {wide}; "
+            "give faces(count, rng) for sets this thin"
+        )
+    return torch.cat(points).to(torch.get_default_dtype()), torch.cat(values).to(torch.get_default_dtype())
+
+
+def _bisect(absorbs, inside: Tensor, outside: Tensor) -> Tensor:
+    """The point of each segment (N, n) from inside to outside at which it leaves the set."""
+    for _ in range(BISECTIONS):
+        middle = (inside + outside) / 2
+        held = absorbs(middle).unsqueeze(-1)
+        inside, outside = torch.where(held, middle, inside), torch.where(held, outside, middle)
+    return inside

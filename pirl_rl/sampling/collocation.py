@@ -1,0 +1,119 @@
+"""Collocation: the interior points (tau, x) at which the HJB residual is imposed.
+
+A sampler returns a TensorDict of fixed size, so that an update keeps static shapes: points that fall inside A or B, or
+that have tau outside (0, T], are masked and not dropped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from pirl_rl.errors import ArgumentError
+from pirl_rl.problem import ReachAvoidProblem
+
+
+class Collocation:
+    """Points (tau, x) of the box (0, T] x states.
+
+    Args:
+        problem: gives the box and the mask.
+        size: points a draw.
+        sampler: "uniform", or "sobol" for scrambled low-discrepancy points.
+        widen: the box's widths are multiplied by this, so that points reach beyond it.
+        tau_power: tau = T U^tau_power; 1 is uniform, 2 puts more points near tau = 0, where V is steep.
+    """
+
+    def __init__(
+        self,
+        problem: ReachAvoidProblem,
+        size: int = 1_000,
+        sampler: Literal["uniform", "sobol"] = "uniform",
+        widen: float = 1.0,
+        tau_power: float = 1.0,
+    ):
+        if sampler not in ("uniform", "sobol"):
+            raise ArgumentError(f"collocation.sampler: expected 'uniform' or 'sobol', got {sampler!r}")
+        if size < 1 or not widen > 0 or not tau_power > 0:
+            raise ArgumentError(
+                f"collocation: expected size >= 1, widen > 0, tau_power > 0, got {size}, {widen}, {tau_power}"
+            )
+        self.problem, self.size, self.sampler, self.tau_power = problem, size, sampler, tau_power
+        self.box = problem.states.expand(widen)
+
+    def sample(self, rng: torch.Generator, replay: TensorDictBase | None = None, progress: float = 0.0) -> TensorDict:
+        """{"tau" (size, 1), "state" (size, n), "mask" (size,)}.
+
+        Args:
+            replay: transitions of the update, for samplers that stay near visited states.
+            progress: of the loss schedule, for samplers that move with it.
+        """
+        unit = self._unit(rng)
+        # 1 - U lies in (0, 1]: tau = 0 belongs to the boundary.
+        tau = self.problem.horizon * (1 - unit[:, :1]) ** self.tau_power
+        state = self.box.denormalize(2 * unit[:, 1:] - 1)
+        return TensorDict({"tau": tau, "state": state, "mask": self.mask(tau, state)}, batch_size=[self.size])
+
+    def mask(self, tau: Tensor, state: Tensor) -> Tensor:
+        """(N,) bool: points where the HJB equation holds."""
+        t = tau.squeeze(-1)
+        known = ~self.problem.interior(state) | self.problem.unreachable(state)
+        return ~known & (t > 0) & (t <= self.problem.horizon)
+
+    def _unit(self, rng: torch.Generator) -> Tensor:
+        dim = 1 + self.box.dim
+        if self.sampler == "uniform":
+            return torch.rand(self.size, dim, generator=rng, device=rng.device)
+        seed = int(torch.randint(2**31, (), generator=rng, device=rng.device))
+        engine = torch.quasirandom.SobolEngine(dim, scramble=True, seed=seed)
+        return engine.draw(self.size).to(rng.device)
+
+
+class ReplayCollocation(Collocation):
+    """Points near those that the policy visits, in the dimensions where a box is mostly empty, and a rest as above.
+
+    A visited (tau, x) is moved by independent normal steps in the coordinates in which (0, T] x states is a cube of
+    width 2. Both the share of such points and the deviation of the steps move with the loss schedule, as in the
+    transition and the refinement stages of the paper.
+
+    Args:
+        problem, size, sampler, widen, tau_power: as of `Collocation`, for the rest.
+        replay_share: share of points near visited ones, at the schedule's start and end.
+        jitter: deviation of the steps, at the schedule's start and end.
+    """
+
+    def __init__(
+        self,
+        problem: ReachAvoidProblem,
+        size: int = 1_000,
+        sampler: Literal["uniform", "sobol"] = "uniform",
+        widen: float = 1.0,
+        tau_power: float = 1.0,
+        replay_share: Sequence[float] = (1.0, 1.0),
+        jitter: Sequence[float] = (0.0, 0.0),
+    ):
+        super().__init__(problem, size, sampler, widen, tau_power)
+        for name, ends, most in (("replay_share", replay_share, 1.0), ("jitter", jitter, float("inf"))):
+            if len(ends) != 2 or not all(0 <= end <= most for end in ends):
+                raise ArgumentError(f"collocation.{name}: expected [start, end] from 0 to {most:g}, got {list(ends)}")
+        self.replay_share, self.jitter = tuple(replay_share), tuple(jitter)
+
+    def sample(self, rng: torch.Generator, replay: TensorDictBase | None = None, progress: float = 0.0) -> TensorDict:
+        rest = super().sample(rng, replay, progress)
+        if replay is None:
+            return rest
+        share, jitter = (start + (end - start) * progress for start, end in (self.replay_share, self.jitter))
+        device, horizon = rng.device, self.problem.horizon
+        index = torch.randint(len(replay), (self.size,), generator=rng, device=device)
+        step = jitter * torch.randn(self.size, 1 + self.problem.states.dim, generator=rng, device=device)
+        # Reflected at both ends of (0, T]: a negative tau has no root, and NaN at a masked point spoils all gradients.
+        tau = torch.abs(replay["tau"][index] + step[:, :1] * horizon / 2)
+        tau = horizon - torch.abs(horizon - tau)
+        state = self.problem.states.denormalize(self.problem.states.normalize(replay["state"][index]) + step[:, 1:])
+        taken = torch.rand(self.size, 1, generator=rng, device=device) < share
+        tau, state = torch.where(taken, tau, rest["tau"]), torch.where(taken, state, rest["state"])
+        return TensorDict({"tau": tau, "state": state, "mask": self.mask(tau, state)}, batch_size=[self.size])
