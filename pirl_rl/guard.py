@@ -10,7 +10,6 @@ from typing import Any
 from pirl_rl.errors import CollapseError
 from pirl_rl.evaluation import Success
 from pirl_rl.learner import Learner
-from pirl_rl.solution import Solution
 
 RATES = ("success_rate", "reward")
 SPREAD = "value_spread"
@@ -96,7 +95,7 @@ class Rollback:
         Raises:
             CollapseError: see `Guard`.
         """
-        metrics = row if row and "success_rate" in row else self.success(Solution(self.learner.loss))
+        metrics = row if row and "success_rate" in row else self.success(self.learner.loss.solution())
         if self.guard.judge(metrics):
             # With the optimisers: those of a collapse would spoil what starts from here.
             self.good, self.good_at = copy.deepcopy(self.learner.state_dict()), update

@@ -42,13 +42,13 @@ class MultiAsyncCollector:
         env: ReachAvoidEnv,
         actor: Actor,
         workers: int = 2,
-        frames_per_batch: int = 256,
+        frames_per_batch: int = 5_120,
         updates_per_batch: int = 32,
         warmup_frames: int = 4_096,
         buffer_size: int = 50_000,
-        exploration_noise: float = 0.2,
+        exploration_noise: float = 0.0,
         exploration: Literal["always", "start"] = "always",
-        n_steps: int = 1,
+        n_steps: int = 20,
         seed: int = 0,
         patience: float = 60.0,
     ):
@@ -91,7 +91,7 @@ class MultiAsyncCollector:
         if self._collector is not None:
             self.start()
 
-    def begin(self, buffer: dict[str, Any] | None) -> None:
+    def warm_start(self, buffer: dict[str, Any] | None) -> None:
         self._random_warmup = False
         if buffer is not None:
             fill_buffer(self.buffer, self._rng.device, self._env, buffer)

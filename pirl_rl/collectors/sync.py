@@ -23,7 +23,8 @@ class SyncCollector:
         actor: the learner's own, its parameters followed live.
         frames_per_batch: transitions a batch, a multiple of the environment's batch size.
         updates_per_batch: updates between two batches.
-        warmup_frames: transitions before the first update, of uniformly random actions; of the actor after `begin`.
+        warmup_frames: transitions before the first update, played by uniformly random actions, or after
+            `warm_start` by the actor.
         buffer_size: capacity of the replay buffer.
         exploration_noise: deviation of the noise on actions.
         exploration: when there is noise, "always" or at the "start" of episodes, see `Exploration`.
@@ -35,13 +36,13 @@ class SyncCollector:
         self,
         env: ReachAvoidEnv,
         actor: Actor,
-        frames_per_batch: int = 256,
-        updates_per_batch: int = 8,
+        frames_per_batch: int = 5_120,
+        updates_per_batch: int = 80,
         warmup_frames: int = 4_096,
         buffer_size: int = 50_000,
-        exploration_noise: float = 0.2,
+        exploration_noise: float = 0.0,
         exploration: Literal["always", "start"] = "always",
-        n_steps: int = 1,
+        n_steps: int = 20,
         seed: int = 0,
     ):
         check_sizes(env, frames_per_batch, updates_per_batch, warmup_frames, buffer_size)
@@ -78,7 +79,7 @@ class SyncCollector:
             self._exploration.deviation = exploration_noise
             self.buffer.empty()
 
-    def begin(self, buffer: dict[str, Any] | None) -> None:
+    def warm_start(self, buffer: dict[str, Any] | None) -> None:
         if buffer is not None:
             fill_buffer(self.buffer, self._rng.device, self.env, buffer)
         # TorchRL's collector then takes its random frames for played; the count is part of the state.
