@@ -10,13 +10,13 @@ from typing import Any, Literal
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torch._dynamo.exc import BackendCompilerFailed
 from torchrl.objectives import SoftUpdate
 
 from pirl_rl.curriculum import StageSettings
 from pirl_rl.errors import ArgumentError, DivergenceError
-from pirl_rl.losses import WEIGHTS, PIRLLoss
-from pirl_rl.schedules import Weights
+from pirl_rl.internals import BackendCompilerFailed
+from pirl_rl.losses import PIRLLoss
+from pirl_rl.schedules import WEIGHTS, Weights
 
 EXPLOSION = 1e6
 """A critic loss above this is a divergence: probabilities err by at most 1, and residuals of interest are far below."""

@@ -17,20 +17,20 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.objectives import TD3Loss
 
 from pirl_rl.actor_rules import ActorRule
 from pirl_rl.errors import ArgumentError
+from pirl_rl.internals import ScheduledTD3Loss
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.operators import generator, masked_mean, require_twice_differentiable
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.schedules import WEIGHTS
 from pirl_rl.solution import Solution
 
 TD_CRITERIA = {"squares": nn.functional.mse_loss, "cross_entropy": nn.functional.binary_cross_entropy}
-WEIGHTS = ("td_weight", "hjb_weight", "boundary_weight")
 
 
-class PIRLLoss(TD3Loss):
+class PIRLLoss(ScheduledTD3Loss):
     """TD3 targets with collocation HJB and boundary terms.
 
     `forward` takes a TensorDict with "replay" (transitions, or states without "next" where no TD term is wanted), and
@@ -62,7 +62,6 @@ class PIRLLoss(TD3Loss):
         TypeError: a critic with an activation that is not C^2.
     """
 
-    _schedulable_buffers = frozenset(WEIGHTS)
     td_weight: Tensor
     hjb_weight: Tensor
     boundary_weight: Tensor

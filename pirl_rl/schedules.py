@@ -9,6 +9,8 @@ from typing import Protocol
 from pirl_rl.errors import ArgumentError
 
 Weights = tuple[float, float, float]
+WEIGHTS = ("td_weight", "hjb_weight", "boundary_weight")
+"""Names of the weights, in this order."""
 
 
 class Schedule(Protocol):

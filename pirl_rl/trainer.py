@@ -22,11 +22,10 @@ from pirl_rl.files import replacing
 from pirl_rl.guard import Rollback
 from pirl_rl.learner import Learner
 from pirl_rl.loggers import MetricsLogger, NoLogger
-from pirl_rl.losses import WEIGHTS
 from pirl_rl.progress import Progress, interruptible
 from pirl_rl.sampling.boundary import BoundarySampler
 from pirl_rl.sampling.collocation import Collocation
-from pirl_rl.schedules import Schedule
+from pirl_rl.schedules import WEIGHTS, Schedule
 
 NEGLIGIBLE = 1e-6
 """Weights below this share of their largest of the run, as a sigmoid has far from its center, are taken for zero."""

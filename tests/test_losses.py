@@ -15,10 +15,11 @@ from torchrl.objectives import TD3Loss
 
 from pirl_rl.actor_rules import ActorRule, ClippedSurrogate, Hamiltonian, LookAhead, Q, Sum
 from pirl_rl.errors import ArgumentError
-from pirl_rl.losses import WEIGHTS, PIRLLoss
+from pirl_rl.losses import PIRLLoss
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.operators import advection, generator
 from pirl_rl.problems import Reach1D, VehicleDrift
+from pirl_rl.schedules import WEIGHTS
 from pirl_rl.simulator import Simulator
 
 RELATIVE = 1e-10

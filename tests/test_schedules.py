@@ -7,10 +7,10 @@ import math
 import pytest
 
 from pirl_rl.actor_rules import Hamiltonian
-from pirl_rl.losses import WEIGHTS, PIRLLoss
+from pirl_rl.losses import PIRLLoss
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.problems import Reach1D
-from pirl_rl.schedules import ConstantSchedule, LinearSchedule, LossSchedule
+from pirl_rl.schedules import WEIGHTS, ConstantSchedule, LinearSchedule, LossSchedule
 
 INITIAL, FINAL = (1.0, 0.0, 0.2), (0.0, 1.0, 3.0)
 LENGTH = 200_000

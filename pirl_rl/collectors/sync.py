@@ -11,6 +11,7 @@ from pirl_rl.checkpoint import restore_rng
 from pirl_rl.collectors.buffers import buffer_state, check_sizes, fill_buffer, load_buffer, make_buffer
 from pirl_rl.collectors.transitions import Exploration, Transitions, exploring_policy
 from pirl_rl.envs import ReachAvoidEnv
+from pirl_rl.internals import carried, plays_at_random
 from pirl_rl.networks import Actor
 from pirl_rl.sampling.initial_states import InitialStates
 
@@ -102,7 +103,7 @@ class SyncCollector:
             "buffer": buffer_state(self.buffer, self._rng),
             "exploration_noise": self.exploration_noise,
             "frames": self._collector.state_dict()["frames"],
-            "carrier": self._collector._carrier.to_dict(),
+            "carrier": carried(self._collector).to_dict(),
             "env_rng": self.env.rng.get_state(),
         }
 
@@ -111,7 +112,7 @@ class SyncCollector:
         self._exploration.deviation = state["exploration_noise"]
         # TorchRL saves no environment state; the carried TensorDict is all that a ReachAvoidEnv has.
         self._load_frames(state["frames"])
-        self._collector._carrier.update(TensorDict(state["carrier"], device=self.env.device))
+        carried(self._collector).update(TensorDict(state["carrier"], device=self.env.device))
         restore_rng(self.env.rng, state["env_rng"])
 
     def _load_frames(self, frames: int) -> None:
@@ -119,6 +120,6 @@ class SyncCollector:
 
     def _collect(self) -> None:
         # TorchRL leaves what the policy wrote before beside a warm-up's random actions.
-        random = self._collector._should_use_random_frames()
+        random = plays_at_random(self._collector)
         batch = next(self._batches)
         self.buffer.extend(self._transitions(batch.exclude("loc") if random else batch))
