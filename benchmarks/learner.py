@@ -21,6 +21,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from pirl_rl.actor_rules import Q
 from pirl_rl.losses import PIRLLoss
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.problem import ReachAvoidProblem
@@ -50,13 +51,13 @@ class SevenStates(ReachAvoidProblem):
 
 
 class NestedLoss(PIRLLoss):
-    """The same loss with the rng by nested autograd."""
+    """The same loss with the generator by nested autograd."""
 
-    def residuals(self, tau: Tensor, x: Tensor, action: Tensor, u: Tensor) -> Tensor:
+    def _residuals(self, tau: Tensor, x: Tensor, action: Tensor, u: Tensor) -> Tensor:
         f, sigma = self.problem.drift(x, u), self.problem.diffusion(x, u)
         count = self.num_qvalue_nets
         y = torch.cat([tau.unsqueeze(-1), x], -1).expand(count, -1, -1).contiguous().requires_grad_()
-        with self.critics() as critic:
+        with self._critics() as critic:
             value = critic(y[..., :1], y[..., 1:], action.expand(count, -1, -1))
         (gradient,) = torch.autograd.grad(value.sum(), y, create_graph=True)
         result = -gradient[..., 0] + (gradient[..., 1:] * f).sum(-1)
@@ -85,9 +86,9 @@ SHAPES = (
 
 def make_batch(shape: Shape) -> TensorDict:
     problem, rng = shape.problem, torch.Generator().manual_seed(0)
-    collocation = Collocation(problem, shape.collocation).sample(rng)
-    boundary = BoundarySampler(problem, shape.boundary // 2, shape.boundary // 2).sample(rng)
-    points = Collocation(problem, shape.transitions)
+    collocation = Collocation(problem, shape.collocation, tau_power=1.0).sample(rng)
+    boundary = BoundarySampler(problem, shape.boundary // 2, shape.boundary // 2, tau_power=1.0).sample(rng)
+    points = Collocation(problem, shape.transitions, tau_power=1.0)
     replay, following = points.sample(rng).exclude("mask"), points.sample(rng).exclude("mask")
     replay["action"] = 2 * torch.rand(shape.transitions, problem.controls.dim, generator=rng) - 1
     following["reward"] = torch.rand(shape.transitions, 1, generator=rng)
@@ -104,8 +105,10 @@ class Learner:
         self.loss = kind(
             shape.problem,
             Actor(shape.problem, (32, 32)),
-            [Critic(shape.problem, shape.critic, root_time=False) for _ in range(2)],
-            actor_rule="q",
+            [Critic(shape.problem, shape.critic, action_input=True, root_time=False) for _ in range(2)],
+            Q(),
+            policy_noise=0.2,
+            hjb_delta=None,
             hjb_weight=1.0,
             boundary_weight=1.0,
         )
@@ -123,7 +126,7 @@ class Learner:
         self.actor_adam = torch.optim.Adam(self.actor, 1e-4, fused=True)
         wrap: Callable = torch.compile if compiled else lambda function: function
         if compiled and kind is NestedLoss:
-            self.loss.residuals = torch.compiler.disable(self.loss.residuals)  # type: ignore[method-assign]
+            self.loss._residuals = torch.compiler.disable(self.loss._residuals)  # type: ignore[method-assign]
         self.critic_loss, self.actor_loss = wrap(self.loss.critic_loss), wrap(self.loss.actor_loss)
         self.hjb_loss = wrap(self.loss._hjb_loss)
         self.count = 0

@@ -200,6 +200,11 @@ class PIRLLoss(ScheduledTD3Loss):
         with params.to_module(self.qvalue_network, preserve_module_state=False):
             yield self.qvalue_network.module  # type: ignore[misc]
 
+    def _residuals(self, tau: Tensor, x: Tensor, action: Tensor, u: Tensor) -> Tensor:
+        """L^u Q_i(., action) (critics, N): tau (N,), x (N, n), the critics' frozen action and the physical u (N, m)."""
+        with self._critics() as critic:
+            return generator(critic.at(action), self.problem, tau, x, u)
+
     def _td_loss(self, replay: TensorDictBase, noise: Tensor) -> Tensor:
         """L_TD summed over critics: (Q_i - r - (1 - d) min_j Q_j^-(y', pi^-(y') + noise))^2."""
         tau, x = replay["next", "tau"], replay["next", "state"]
@@ -221,8 +226,7 @@ class PIRLLoss(ScheduledTD3Loss):
             if self.hjb_noise:
                 action = (action + self._clipped_noise(action, self.hjb_noise, self.hjb_noise_clip)).clamp(-1, 1)
             u = self.problem.controls.denormalize(action)
-        with self._critics() as critic:
-            residual = generator(critic.at(action), self.problem, points["tau"].squeeze(-1), points["state"], u)
+        residual = self._residuals(points["tau"].squeeze(-1), points["state"], action, u)
         squares = _huber(residual, self.hjb_delta)
         return masked_mean(squares.sum(0), points["mask"])
 

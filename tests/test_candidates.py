@@ -130,7 +130,7 @@ def test_weights_of_the_start_are_those_of_its_last_update(tmp_path):
     assert (begun.collocation_jitter, begun.collocation_replay_share) == (pytest.approx(0.18), pytest.approx(0.6))
     assert {"reward", "calibration_mae", "success_low"} <= begun.metrics.keys()
     early = begin(candidates, str(checkpoint.weights_path(path.parent, 5)))
-    assert measure(candidates, early).weights == trainer.learner.schedule(4)
+    assert measure(candidates, early).weights == trainer.curriculum.weights(4)
     plain = small_trainer(tmp_path / "plain", "evaluation.final=[success,calibration]")
     begun = measure(plain, begin(plain, str(path)))
     assert (begun.collocation_jitter, begun.collocation_replay_share) == (None, None)

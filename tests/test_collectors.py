@@ -132,7 +132,7 @@ def test_sync_collects_at_its_pace_and_with_the_learners_actor(tmp_path):
     collector.step(9)
     fresh = collector.buffer[512 % 600 + 128 :][:88]
     with torch.no_grad():
-        expected = loss.act(fresh["tau"], fresh["state"])
+        expected = loss.solution().actor(fresh["tau"], fresh["state"])
     torch.testing.assert_close(fresh["action"], expected)
     collector.close()
 

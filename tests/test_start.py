@@ -45,7 +45,7 @@ def played_by_the_actor(trainer: Trainer, first: int) -> bool:
     """Whether the actions of a buffer from an index on are those of the noise-free actor."""
     batch = trainer.collector.buffer[first:]
     with torch.no_grad():
-        action = trainer.learner.loss.act(batch["tau"], batch["state"])
+        action = trainer.solution.actor(batch["tau"], batch["state"])
     return len(batch) > 0 and torch.allclose(batch["action"], action, atol=1e-6)
 
 
