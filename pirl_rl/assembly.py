@@ -96,6 +96,7 @@ def make_trainer(config: DictConfig, folder: Path | None = None, trust: Sequence
         boundary=build(config.boundary, "boundary", trust, problem=problem),
         during=make_evaluators(config.evaluation, "during", trust),
         final=make_evaluators(config.evaluation, "final", trust),
+        simulator=make_simulator(config.evaluation, problem),
         stages=stages,
         logger=build(config.logger, "logger", trust),
         folder=folder,
@@ -115,12 +116,19 @@ def _make_stage(node: DictConfig, key: str, trust: Sequence[str], problem: Reach
         raise ConfigError(f"{key}: {error}") from None
 
 
-def make_evaluators(config: DictConfig, when: str, trust: Sequence[str]) -> list[Evaluator]:
+def make_simulator(config: DictConfig, problem: ReachAvoidProblem) -> Simulator:
+    """The simulator of the evaluators, from the node `evaluation`."""
+    return build(config.simulator, "evaluation.simulator", problem=problem)
+
+
+def make_evaluators(config: DictConfig, when: str, trust: Sequence[str]) -> dict[str, Evaluator]:
+    """The evaluators of the list `when`, "during" or "final", of the node `evaluation`, by name."""
     names = config[when]
-    known = [str(name) for name in config if isinstance(config[name], DictConfig)]
+    nodes = [str(name) for name in config if isinstance(config[name], DictConfig)]
+    known = [name for name in nodes if name != "simulator"]
     if not isinstance(names, ListConfig) or not all(name in known for name in names):
         raise ConfigError(f"evaluation.{when}: expected a list of names out of {', '.join(known)}, got {names}")
-    return [build(config[name], f"evaluation.{name}", trust) for name in names]
+    return {name: build(config[name], f"evaluation.{name}", trust) for name in names}
 
 
 def restore(trainer: Trainer) -> None:

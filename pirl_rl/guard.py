@@ -10,6 +10,7 @@ from typing import Any
 from pirl_rl.errors import CollapseError
 from pirl_rl.evaluation import Success
 from pirl_rl.learner import Learner
+from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
 RATES = ("success_rate", "reward")
@@ -84,8 +85,9 @@ class Rollback:
         collapsed_at: the update after which a collapse was noticed; None without one.
     """
 
-    def __init__(self, learner: Learner, success: Success):
-        self.learner, self.success, self.guard = learner, success, Guard(success.episodes)
+    def __init__(self, learner: Learner, success: Success, simulator: Simulator):
+        self.learner, self.success, self.simulator = learner, success, simulator
+        self.guard = Guard(success.episodes)
         self.good: dict[str, Any] = {}
         self.good_at: int | None = None
         self.collapsed_at: int | None = None
@@ -96,7 +98,9 @@ class Rollback:
         Raises:
             CollapseError: see `Guard`.
         """
-        metrics = row if row and "success_rate" in row else self.success(Solution(self.learner.loss))
+        metrics = row
+        if not metrics or "success_rate" not in metrics:
+            metrics = self.success(Solution(self.learner.loss), self.simulator).metrics()
         if self.guard.judge(metrics):
             # With the optimisers: those of a collapse would spoil what starts from here.
             self.good, self.good_at = copy.deepcopy(self.learner.state_dict()), update

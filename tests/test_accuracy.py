@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from pirl_rl.evaluation.evidence import draw_evidence
 
 from pirl_rl.evaluation import METRICS, Accuracy
 from pirl_rl.evaluation.accuracy import AccuracyEvidence
-from pirl_rl.evaluation.evidence import draw_evidence
 from pirl_rl.evaluation.reference_states import ReferenceStates
 from pirl_rl.problems import Reach1D, VehicleDrift
 from pirl_rl.sets import Box
