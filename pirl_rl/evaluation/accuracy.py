@@ -89,31 +89,27 @@ class Accuracy:
         }
 
     def _meanings_under(self, name: str, simulator: Simulator) -> dict[str, str]:
-        levels = {f"p{100 * p:.0f}": p for p in LEVELS}
-        return {
+        meanings = {
             "mse": f"The mean square of V minus Monte Carlo, the mean payoff of {self.rollouts:,} rollouts of the "
-            f"learned policy from each reference state, with control steps of {simulator.dt:g} s, {simulator.substeps} "
-            f"integration steps in each, and the exit rule {simulator.crossing}; V is 1 in A and 0 in B.",
+            f"learned policy from each reference state, with control steps of {simulator.dt:g} s, integration steps of "
+            f"{simulator.dt / simulator.substeps:g} s and the exit rule {simulator.crossing}; V is 1 in A and 0 in B.",
             "mae": f"The mean absolute value of the difference in {name}_mse.",
             "noise": f"The {name}_mse that a perfect V would have: the variance of the Monte Carlo means.",
             "raw_mse": f"As {name}_mse, for the networks' own V.",
-            "mse_band": f"As {name}_mse, over the states from which the target can be reached.",
+            "mse_band": f"As {name}_mse, over the states from which the problem does not rule the target out.",
             **{
-                f"mse_{group}": f"As {name}_mse, over fifth {i + 1} of the reference states, ordered by their distance "
-                "to the states that a reference policy visits."
+                f"mse_{group}": f"As {name}_mse, over group {i + 1} of {len(GROUPS)} of the reference states, counted "
+                "from the closest to those that a reference policy visits."
                 for i, group in enumerate(GROUPS)
             },
             "success": f"The mean over the reference states of the Monte Carlo in {name}_mse.",
-            "success_band": f"As {name}_success, over the states from which the target can be reached.",
-            **{
-                f"precision_{key}": f"The share of the states with V > {p} whose Monte Carlo is above {p} too."
-                for key, p in levels.items()
-            },
-            **{
-                f"recall_{key}": f"The share of the states with Monte Carlo > {p} whose V is above {p} too."
-                for key, p in levels.items()
-            },
+            "success_band": f"As {name}_success, over the states from which the problem does not rule the target out.",
         }
+        for p in LEVELS:
+            level = f"p{100 * p:.0f}"
+            meanings[f"precision_{level}"] = f"The share of the states with V > {p} whose Monte Carlo is above {p} too."
+            meanings[f"recall_{level}"] = f"The share of the states with Monte Carlo > {p} whose V is above {p} too."
+        return meanings
 
     def __call__(self, solution: Solution, simulator: Simulator) -> AccuracyEvidence:
         """Measure a solution under the evaluator's own simulators; the one that is handed to it is not used."""
