@@ -26,11 +26,11 @@ import torch
 from torch import Tensor, nn
 
 from pirl_rl import load_run
-from pirl_rl.evaluation import Accuracy, Rollouts, Slices
-from pirl_rl.evaluation.accuracy import SIMULATORS
+from pirl_rl.evaluation import Accuracy, Evidence, Rollouts, Slices, evaluate, metrics_of
+from pirl_rl.evaluation.accuracy import SIMULATORS, AccuracyEvidence
 from pirl_rl.evaluation.monte_carlo import Policy, mean_payoff
 from pirl_rl.evaluation.reference_states import displaced, visited_by
-from pirl_rl.figures.run import save_figures
+from pirl_rl.figures import draw_all, save_figures
 from pirl_rl.problems import VehicleDrift
 from pirl_rl.problems.drift.reference_states import NETWORK_BOX, DriftStates
 from pirl_rl.problems.drift.starts import EquilibriumStates
@@ -154,6 +154,13 @@ def _stack(weights: Mapping[str, Tensor], prefix: str, activation: nn.Module, ou
     return nn.Sequential(*layers[:-1], output).requires_grad_(False)
 
 
+def unmasked(accuracy: Evidence) -> AccuracyEvidence:
+    """The same evidence with the networks' own V in place of the masked one."""
+    assert isinstance(accuracy, AccuracyEvidence)
+    raw = {name: dataclasses.replace(one, value=one.raw_value) for name, one in accuracy.comparisons.items()}
+    return dataclasses.replace(accuracy, comparisons=raw)
+
+
 def markdown(results: Mapping[str, Mapping[str, float]]) -> str:
     lines = ["| " + " | ".join(["model", *COLUMNS.values()]) + " |", "|---" + "|--:" * len(COLUMNS) + "|"]
     for model, numbers in results.items():
@@ -174,18 +181,20 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     results: dict[str, dict[str, float]] = {}
+    evaluators = {
+        "accuracy": Accuracy(DriftStates(), arguments.rollouts),
+        "slices": Slices(rollouts=arguments.slice_rollouts),
+        "rollouts": Rollouts(),
+    }
 
     def measure(name: str, solution) -> None:
-        accuracy = Accuracy(DriftStates(), arguments.rollouts).measure(solution)
-        slices, rollouts = Slices(rollouts=arguments.slice_rollouts).measure(solution), Rollouts().measure(solution)
+        simulator = Simulator(solution.problem, **SIMULATORS["fine"])
+        evidence = evaluate(solution, simulator, evaluators)
         if isinstance(solution, Baseline):
-            unmasked = dataclasses.replace(accuracy, value=accuracy.raw_value)
-            results[name] = unmasked.numbers() | slices.numbers()
+            results[name] = metrics_of(evidence | {"accuracy": unmasked(evidence["accuracy"])})
             name = f"{name}, masked"
-        results[name] = accuracy.numbers() | slices.numbers()
-        save_figures(
-            accuracy.figures() | slices.figures() | rollouts.figures(), arguments.out / name.replace(", ", "-")
-        )
+        results[name] = metrics_of(evidence)
+        save_figures(draw_all(evidence), arguments.out / name.replace(", ", "-"))
         print(markdown({name: results[name]}).splitlines()[-1], flush=True)
 
     for path in sorted(arguments.weights.glob("*.npz")):

@@ -47,12 +47,6 @@ def make_networks(
     return actor, [build(config.critic, "critic", trust, problem=problem).to(device) for _ in range(count)]
 
 
-def make_simulator(config: DictConfig, problem: ReachAvoidProblem) -> Simulator:
-    """The simulator that the environment plays."""
-    steps = {name: config.env[name] for name in ("dt", "substeps", "crossing") if name in config.env}
-    return Simulator(problem, **steps)
-
-
 def make_trainer(config: DictConfig, folder: Path | None = None, trust: Sequence[str] = ()) -> Trainer:
     """Everything a configuration names, put together; nothing is written yet.
 
@@ -86,6 +80,7 @@ def make_trainer(config: DictConfig, folder: Path | None = None, trust: Sequence
         stages=[_make_stage(node, f"stages[{i}]", trust, parts) for i, node in enumerate(config.stages)],
         during=make_evaluators(config.evaluation, "during", trust),
         final=make_evaluators(config.evaluation, "final", trust),
+        simulator=make_simulator(config.evaluation, env.problem),
         logger=build(config.logger, "logger", trust),
         folder=folder,
         config=OmegaConf.to_container(config, resolve=True),
@@ -98,12 +93,19 @@ def _make_stage(node: DictConfig, key: str, trust: Sequence[str], parts: Mapping
     return build(stage, key, trust, parts)
 
 
-def make_evaluators(config: DictConfig, when: str, trust: Sequence[str]) -> list[Evaluator]:
+def make_simulator(config: DictConfig, problem: ReachAvoidProblem) -> Simulator:
+    """The simulator of the evaluators, from the node `evaluation`."""
+    return build(config.simulator, "evaluation.simulator", problem=problem)
+
+
+def make_evaluators(config: DictConfig, when: str, trust: Sequence[str]) -> dict[str, Evaluator]:
+    """The evaluators of the list `when`, "during" or "final", of the node `evaluation`, by name."""
     names = config[when]
-    known = [str(name) for name in config if isinstance(config[name], DictConfig)]
+    nodes = [str(name) for name in config if isinstance(config[name], DictConfig)]
+    known = [name for name in nodes if name != "simulator"]
     if not isinstance(names, ListConfig) or not all(name in known for name in names):
         raise ConfigError(f"evaluation.{when}: expected a list of names out of {', '.join(known)}, got {names}")
-    return [build(config[name], f"evaluation.{name}", trust) for name in names]
+    return {name: build(config[name], f"evaluation.{name}", trust) for name in names}
 
 
 def restore(trainer: Trainer) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 from pirl_rl.errors import CollapseError
 from pirl_rl.evaluation import Success
 from pirl_rl.learner import Learner
+from pirl_rl.simulator import Simulator
 
 RATES = ("success_rate", "reward")
 SPREAD = "value_spread"
@@ -83,8 +84,9 @@ class Rollback:
         collapsed_at: the update after which a collapse was noticed; None without one.
     """
 
-    def __init__(self, learner: Learner, success: Success):
-        self.learner, self.success, self.guard = learner, success, Guard(success.episodes)
+    def __init__(self, learner: Learner, success: Success, simulator: Simulator):
+        self.learner, self.success, self.simulator = learner, success, simulator
+        self.guard = Guard(success.episodes)
         self.good: dict[str, Any] = {}
         self.good_at: int | None = None
         self.collapsed_at: int | None = None
@@ -95,7 +97,9 @@ class Rollback:
         Raises:
             CollapseError: see `Guard`.
         """
-        metrics = row if row and "success_rate" in row else self.success(self.learner.loss.solution())
+        metrics = row
+        if not metrics or "success_rate" not in metrics:
+            metrics = self.success(self.learner.loss.solution(), self.simulator).metrics()
         if self.guard.judge(metrics):
             # With the optimisers: those of a collapse would spoil what starts from here.
             self.good, self.good_at = copy.deepcopy(self.learner.state_dict()), update

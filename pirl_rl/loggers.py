@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
+import numpy as np
 from torchrl.record.loggers import get_logger
 
 from pirl_rl.files import replacing
@@ -116,6 +117,18 @@ class NoLogger:
 
     def close(self) -> None:
         pass
+
+
+def read_metrics(path: str | Path) -> dict[str, np.ndarray]:
+    """The columns of a metrics.csv as float arrays (rows,), NaN where a cell is empty.
+
+    Raises:
+        OSError, ValueError: the file cannot be read, or a cell is no number.
+    """
+    with open(path, newline="") as file:
+        rows = csv.DictReader(file)
+        names, cells = rows.fieldnames or [], list(rows)
+    return {name: np.array([float(row[name] or "nan") for row in cells]) for name in names}
 
 
 def _has_wandb_account() -> bool:

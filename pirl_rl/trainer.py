@@ -17,7 +17,7 @@ from pirl_rl import checkpoint
 from pirl_rl.collectors import TransitionCollector
 from pirl_rl.curriculum import Curriculum, Stage, StageSettings
 from pirl_rl.errors import ArgumentError, DivergenceError, Interrupted
-from pirl_rl.evaluation import Evaluator, Success, evaluate
+from pirl_rl.evaluation import Evaluator, Evidence, Success, evaluate, metrics_of
 from pirl_rl.files import replacing
 from pirl_rl.guard import Rollback
 from pirl_rl.learner import Learner
@@ -26,6 +26,7 @@ from pirl_rl.progress import Progress, interruptible
 from pirl_rl.sampling.boundary import BoundarySampler
 from pirl_rl.sampling.collocation import Collocation
 from pirl_rl.schedules import WEIGHTS, Schedule
+from pirl_rl.simulator import Simulator
 
 NEGLIGIBLE = 1e-6
 """Weights below this share of their largest of the run, as a sigmoid has far from its center, are taken for zero."""
@@ -33,6 +34,9 @@ NEGLIGIBLE = 1e-6
 
 class Trainer:
     """Trains a learner and leaves the evidence in a run directory.
+
+    Attributes:
+        evidence: of the evaluators of the end, by name; empty before the end of training.
 
     Args:
         learner: makes the updates.
@@ -46,7 +50,8 @@ class Trainer:
         evaluate_every: updates between evaluations during training; 0 for none.
         checkpoint_every: updates between checkpoints; 0 for the last one only.
         rollback: end the run where training collapses, with the networks of the last good evaluation; see `Guard`.
-        during, final: evaluators during and after training.
+        during, final: evaluators during and after training, by name.
+        simulator: plays the paths of the evaluators; default that of the problem with its own defaults.
         logger: where rows go.
         folder: the run directory; None keeps everything in memory.
         config: what made this run, for loggers.
@@ -67,8 +72,9 @@ class Trainer:
         evaluate_every: int = 1_500,
         checkpoint_every: int = 5_000,
         rollback: bool = False,
-        during: Sequence[Evaluator] = (),
-        final: Sequence[Evaluator] = (),
+        during: Mapping[str, Evaluator] | None = None,
+        final: Mapping[str, Evaluator] | None = None,
+        simulator: Simulator | None = None,
         logger: MetricsLogger | None = None,
         folder: Path | str | None = None,
         config: Mapping[str, Any] | None = None,
@@ -99,7 +105,9 @@ class Trainer:
             learner.loss.check_rule(settings.actor_rule, settings.exploration_noise)
         self.updates, self.batch_size = updates, batch_size
         self.log_every, self.evaluate_every, self.checkpoint_every = log_every, evaluate_every, checkpoint_every
-        self.during, self.final = tuple(during), tuple(final)
+        self.during, self.final = dict(during or {}), dict(final or {})
+        self.simulator = simulator or Simulator(learner.loss.problem)
+        self.evidence: dict[str, Evidence] = {}
         self.folder = None if folder is None else Path(folder)
         self.logger = logger if logger is not None and self.folder is not None else NoLogger()
         self.config = dict(config or {})
@@ -111,14 +119,13 @@ class Trainer:
         self.update, self.saved, self.wall_seconds = 0, 0, 0.0
 
     def _make_rollback(self) -> Rollback:
-        success = next((one for one in self.during if isinstance(one, Success)), None)
+        success = next((one for one in self.during.values() if isinstance(one, Success)), None)
         if success is None or not self.evaluate_every:
             raise ArgumentError(
                 "trainer.rollback: it judges evaluations during training, expected trainer.evaluate_every >= 1 and "
-                f"success in evaluation.during, got {self.evaluate_every} and "
-                f"{[type(one).__name__ for one in self.during]}"
+                f"success in evaluation.during, got {self.evaluate_every} and {list(self.during)}"
             )
-        return Rollback(self.learner, success)
+        return Rollback(self.learner, success, self.simulator)
 
     def train(self) -> dict[str, float]:
         """Run to the last update; returns the summary.
@@ -219,16 +226,17 @@ class Trainer:
             value = terms[name].item() if name in terms else math.nan
             row[name if name.startswith("loss") else f"train_{name}"] = value
         if evaluates:
-            row |= evaluate(self.solution, self.during)
+            row |= metrics_of(evaluate(self.solution, self.simulator, self.during))
         return row
 
     def _finish(self) -> dict[str, float]:
+        self.evidence = evaluate(self.solution, self.simulator, self.final)
         summary = {
             "updates": self.update,
             "wall_seconds": self.wall_seconds,
             "updates_per_second": self.update / self.wall_seconds if self.update else 0.0,
             **({} if self.rollback is None else self.rollback.summary()),
-            **evaluate(self.solution, self.final),
+            **metrics_of(self.evidence),
         }
         if self.folder is not None:
             with replacing(self.folder / "summary.json") as file:

@@ -15,6 +15,7 @@ import torch
 from pirl_rl.assembly import make_trainer, restore
 from pirl_rl.commands.composition import compose
 from pirl_rl.configuration import save_config
+from pirl_rl.simulator import Simulator
 from pirl_rl.trainer import Trainer
 
 QUICK = ("+experiment=reach1d", "+debug=default", "evaluation.final=[exact]", "evaluation.during=[exact]")
@@ -44,6 +45,11 @@ def resumed(folder: Path, *overrides: str) -> Trainer:
     trainer = small_trainer(folder, *overrides)
     restore(trainer)
     return trainer
+
+
+def metrics(evaluator, solution, **steps) -> dict[str, float]:
+    """What an evaluator makes of a solution, under a simulator of the given dt, substeps and crossing."""
+    return evaluator(solution, Simulator(solution.problem, **steps)).metrics()
 
 
 def at_update(trainer: Trainer, update: int, action) -> None:

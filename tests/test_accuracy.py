@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import pytest
 import torch
+from matplotlib.figure import Figure
+from small import metrics as measure
 
-from pirl_rl.evaluation import METRICS, Accuracy
+from pirl_rl.evaluation import Accuracy, Calibration, Metrics
 from pirl_rl.evaluation.accuracy import AccuracyEvidence
-from pirl_rl.evaluation.evidence import draw_evidence
 from pirl_rl.evaluation.reference_states import ReferenceStates
+from pirl_rl.evaluation.rollout_comparison import RolloutComparison
+from pirl_rl.figures import draw, draw_all
 from pirl_rl.problems import Reach1D, VehicleDrift
 from pirl_rl.sets import Box
+from pirl_rl.simulator import Simulator
 
 BRIDGE = {"exact": {"dt": 0.1, "substeps": 1, "crossing": "bridge"}}
 
@@ -52,7 +56,8 @@ def by_hand() -> AccuracyEvidence:
     raw = torch.tensor([0.95, 0.60, 0.40, 0.05, 0.3, 0.2], dtype=torch.float64)
     reachable = torch.tensor([True, True, True, True, False, False])
     reference = ReferenceStates(torch.ones(6), torch.zeros(6, 1), torch.arange(6.0), group)
-    return AccuracyEvidence(reference, value, raw, reachable, {"some": mean}, rollouts=11)
+    comparison = RolloutComparison(reference.tau, reference.x, value, raw, mean, rollouts=11)
+    return AccuracyEvidence(reference, reachable, {"some": comparison})
 
 
 def test_numbers_by_hand():
@@ -79,11 +84,11 @@ def test_numbers_by_hand():
         "precision_p90": 0.0,
         "recall_p90": 1.0,
     }
-    assert by_hand().numbers() == pytest.approx({f"some_{name}": value for name, value in expected.items()})
+    assert by_hand().metrics() == pytest.approx({f"some_{name}": value for name, value in expected.items()})
 
 
 def test_bars_are_the_numbers():
-    numbers, axes = by_hand().numbers(), by_hand().figures()["accuracy"].axes
+    numbers, axes = by_hand().metrics(), draw(by_hand())["accuracy"].axes
     bars = [bar.get_height() for bar in axes[1].patches]
     assert bars == pytest.approx(
         [numbers[f"some_mse_{name}"] for name in ("closest", "near", "moderate", "far", "farthest")]
@@ -92,7 +97,7 @@ def test_bars_are_the_numbers():
 
 def test_reliability_shows_every_reachable_state_in_its_bin():
     """V = 0.95, 0.6, 0.4 and 0.05: one state in each of four bins, at the height of its Monte Carlo mean."""
-    axes = by_hand().figures()["accuracy"].axes[0]
+    axes = draw(by_hand())["accuracy"].axes[0]
     counts = [int(text.get_text()) for text in axes.texts]
     assert counts == [1, 0, 0, 0, 1, 0, 1, 0, 0, 1]
     points = axes.containers[0].lines[0].get_xydata()
@@ -102,7 +107,7 @@ def test_reliability_shows_every_reachable_state_in_its_bin():
 def test_error_of_the_exact_value_is_the_noise():
     """The mean square of the Monte Carlo error is its variance, within 4 standard errors: of 400 squares of nearly
     normal variables of different variance, each about 1.5 times its mean."""
-    numbers = Accuracy(states, 128, BRIDGE)(Known())
+    numbers = measure(Accuracy(states, 128, BRIDGE), Known())
     assert numbers["exact_mse"] == pytest.approx(numbers["exact_noise"], rel=4 * 1.9 / 400**0.5)
     tau, x = states().tau.double(), states().x.double()
     exact = Known().value(tau, x)
@@ -113,7 +118,7 @@ def test_error_of_the_exact_value_is_the_noise():
 def test_error_of_a_known_offset():
     """An offset of 0.2 is in the raw V everywhere, in the masked V where it is not known; 0.1 of slack for the product
     of offset and Monte Carlo error."""
-    exact, wrong = (Accuracy(states, 128, BRIDGE)(Known(offset)) for offset in (0.0, 0.2))
+    exact, wrong = (measure(Accuracy(states, 128, BRIDGE), Known(offset)) for offset in (0.0, 0.2))
     assert wrong["exact_mse_band"] - exact["exact_mse_band"] == pytest.approx(0.04, rel=0.1)
     lost = states().x[:, 0] < -1
     assert wrong["exact_mse"] - exact["exact_mse"] == pytest.approx(0.04 * (~lost).float().mean().item(), rel=0.1)
@@ -122,21 +127,43 @@ def test_error_of_a_known_offset():
 
 
 def test_simulators_differ_and_calls_repeat():
-    """Watching at end points only misses some hits."""
+    """Watching at end points only misses some hits. The simulator that is handed to all evaluators plays no part."""
     evaluator = Accuracy(states, 64, BRIDGE | {"coarse": {"dt": 0.1, "substeps": 1, "crossing": "endpoint"}})
-    first, again = evaluator(Known()), evaluator(Known())
+    first, again = measure(evaluator, Known()), measure(evaluator, Known(), dt=0.5)
     assert first == again
     assert first["coarse_success"] < first["exact_success"] - 0.01
 
 
-def test_evidence_is_drawn_once_measured():
-    evaluator = Accuracy(states, 2, BRIDGE)
-    assert draw_evidence([evaluator, object()]) == {}
-    evaluator(Known())
-    assert list(draw_evidence([evaluator, object()])) == ["accuracy"]
+def test_evidence_is_drawn_by_its_class():
+    evidence = Accuracy(states, 2, BRIDGE)(Known(), Simulator(Known().problem))
+    assert draw(Metrics({"some": 1.0})) == {}
+    assert list(draw_all({"numbers": Metrics({"some": 1.0}), "accuracy": evidence})) == ["accuracy"]
 
 
-def test_every_number_is_documented():
+class Mine(Metrics):
+    """Evidence of a class that the package does not know."""
+
+
+def test_a_class_of_evidence_registers_what_draws_it():
+    @draw.register
+    def draw_mine(evidence: Mine) -> dict[str, Figure]:
+        return {"mine": Figure()}
+
+    assert list(draw_all({"a": Metrics({}), "b": Mine({})})) == ["mine"]
+
+
+def test_accuracy_and_calibration_are_one_estimator():
+    """On the same points and noise, both have the same errors."""
+    calibration = Calibration(50, 16)(Known(0.1), Simulator(Known().problem))
+    points = calibration.comparison
+    reference = ReferenceStates(points.tau, points.x, torch.arange(50.0), torch.arange(50) // 10)
+    accuracy = measure(Accuracy(lambda: reference, 16, {"same": {"dt": 0.1}}), Known(0.1))
+    assert calibration.metrics() == {
+        f"calibration_{name}": accuracy[f"same_{name}"] for name in ("mse", "mae", "noise")
+    }
+
+
+def test_every_metric_of_the_drifting_problem_has_a_meaning():
     class Hold:
         problem, dtype, device = VehicleDrift(), torch.float32, torch.device("cpu")
 
@@ -148,8 +175,10 @@ def test_every_number_is_documented():
 
         value = raw_value
 
-    numbers = Accuracy(states_of_drift, 2)(Hold())
-    assert set(numbers) == {name for name in METRICS if name.startswith(("fine_", "paper_"))}
+    evaluator = Accuracy(states_of_drift, 2)
+    meanings = evaluator.meanings(Hold.problem)
+    assert list(measure(evaluator, Hold())) == list(meanings)
+    assert {name.partition("_")[0] for name in meanings} == {"fine", "paper"}
 
 
 def states_of_drift() -> ReferenceStates:

@@ -12,7 +12,7 @@ from pirl_rl import checkpoint
 from pirl_rl.actor_rules import ClippedSurrogate, Hamiltonian, LookAhead
 from pirl_rl.curriculum import Curriculum, Stage
 from pirl_rl.errors import ConfigError, Interrupted
-from pirl_rl.figures.run import read_metrics
+from pirl_rl.loggers import read_metrics
 from pirl_rl.schedules import ConstantSchedule, LinearSchedule, LossSchedule
 
 WHOLE = LossSchedule([1, 0, 0], [0, 1, 1], center=50, steepness=0.1)

@@ -6,19 +6,38 @@ import math
 
 import pytest
 import torch
+from small import metrics as measure
 from torch import Tensor
 
-from pirl_rl.evaluation import METRICS, Calibration, ExactError, Residuals, Success, evaluate
+from pirl_rl import problems
+from pirl_rl.evaluation import (
+    Accuracy,
+    Calibration,
+    ExactError,
+    Residuals,
+    Rollouts,
+    Slices,
+    Success,
+    evaluate,
+    meanings_of,
+    metrics_of,
+)
 from pirl_rl.evaluation.reference_states import ReferenceStates
-from pirl_rl.losses import PIRLLoss
-from pirl_rl.networks import Actor, Critic
+from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.operators import generator
 from pirl_rl.payoffs import LipschitzPayoff
 from pirl_rl.problems import Reach1D, Safety1D
 from pirl_rl.sampling.initial_states import UniformStates
+from pirl_rl.sets import Box
+from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
-EVALUATORS = [ExactError(), Calibration(32, 32), Success(500), Residuals(256)]
+EVALUATORS = {
+    "exact": ExactError(),
+    "calibration": Calibration(32, 32),
+    "success": Success(500),
+    "residuals": Residuals(256),
+}
 
 
 def normal_cdf(z: Tensor) -> Tensor:
@@ -62,18 +81,18 @@ class Known:
 def network(request):
     torch.manual_seed(0)
     problem = request.param()
-    return Solution(PIRLLoss(problem, Actor(problem), [Critic(problem), Critic(problem)]))
+    return Solution(problem, Actor(problem), stack([Critic(problem, action_input=True) for _ in range(2)]))
 
 
 def test_exact_error_of_the_exact_value_is_zero():
-    metrics = ExactError()(Known())
+    metrics = measure(ExactError(), Known())
     assert max(metrics.values()) < 1e-10
     assert set(metrics) == {"value_mse", "value_max_error", "masked_value_mse"}
 
 
 def test_exact_error_of_a_known_offset():
     """An offset of 0.1 is in every raw value; the mask takes it off on the 1 of 201 columns that lies in the target."""
-    metrics = ExactError()(Known(offset=0.1))
+    metrics = measure(ExactError(), Known(offset=0.1))
     assert metrics["value_mse"] == pytest.approx(0.01)
     assert metrics["value_max_error"] == pytest.approx(0.1)
     assert metrics["masked_value_mse"] == pytest.approx(0.01 * 200 / 201)
@@ -81,7 +100,7 @@ def test_exact_error_of_a_known_offset():
 
 def test_exact_error_needs_an_exact_value(network):
     known = network.problem.exact_value(torch.ones(1), torch.zeros(1, 1)) is not None
-    assert bool(ExactError(11, 11)(network)) == known
+    assert bool(measure(ExactError(11, 11), network)) == known
 
 
 def test_exact_error_in_two_dimensions_samples_the_box():
@@ -90,11 +109,11 @@ def test_exact_error_in_two_dimensions_samples_the_box():
 
     known = Known(offset=0.1)
     known.problem = Plane()
-    assert ExactError(20, 20)(known)["value_mse"] == pytest.approx(0.01)
+    assert measure(ExactError(20, 20), known)["value_mse"] == pytest.approx(0.01)
 
 
 def test_residuals_of_the_exact_value_vanish():
-    metrics = Residuals(1024)(Known())
+    metrics = measure(Residuals(1024), Known())
     assert metrics["hjb_loss"] < 1e-16
     assert metrics["hjb_sup_loss"] < 1e-16
     assert metrics["boundary_loss"] < 1e-8
@@ -103,7 +122,7 @@ def test_residuals_of_the_exact_value_vanish():
 def test_sup_residual_exposes_a_reversed_policy():
     """The value of u = -1 solves its own linear equation and the boundary; max_u L^u V = 2 V_x betrays it."""
     reversed_policy = Known(u=-1.0)
-    metrics = Residuals(1024)(reversed_policy)
+    metrics = measure(Residuals(1024), reversed_policy)
     assert metrics["hjb_loss"] < 1e-16
     assert metrics["boundary_loss"] < 1e-8
     uniform = torch.Generator().manual_seed(5)
@@ -121,7 +140,7 @@ def test_residuals_on_reference_states_are_those_of_the_states():
     tau, x = torch.tensor([0.5, 1.0, 1.5, 0.0]), torch.tensor([[1.0], [0.0], [-1.0], [0.0]])
     states = ReferenceStates(tau, x, torch.zeros(4), torch.arange(4))
     reversed_policy = Known(u=-1.0)
-    metrics = Residuals(64, states=lambda: states)(reversed_policy)
+    metrics = measure(Residuals(64, states=lambda: states), reversed_policy)
     # The last state has no time to go, and no equation.
     slope = reversed_policy.gradient(tau[:3].double(), x[:3].double())
     assert metrics["hjb_sup_loss"] == pytest.approx((2 * slope).square().mean().item(), rel=1e-6)
@@ -131,19 +150,18 @@ def test_residuals_on_reference_states_are_those_of_the_states():
 def test_gradient_is_that_of_the_raw_value(network):
     tau, x = torch.rand(50), network.problem.states.sample(50, torch.Generator().manual_seed(0))
     action = network._action(tau, x)
-    with network.loss.critics() as critic:
-        value = critic.at(action.detach())
+    value = network.critic.at(action.detach())
 
-        def one(t, y):
-            frozen = network._action(t.reshape(1), y.reshape(1, 1)).detach()
-            return value.critic(t.reshape(1, 1), y.reshape(1, 1), frozen)
+    def one(t, y):
+        frozen = network._action(t.reshape(1), y.reshape(1, 1)).detach()
+        return value.critic(t.reshape(1, 1), y.reshape(1, 1), frozen)
 
-        exact = [torch.func.jacfwd(lambda y, t=t: one(t, y).mean())(y) for t, y in zip(tau, x, strict=True)]
+    exact = [torch.func.jacfwd(lambda y, t=t: one(t, y).mean())(y) for t, y in zip(tau, x, strict=True)]
     torch.testing.assert_close(network.gradient(tau, x), torch.stack(exact).reshape(50, 1), atol=1e-5, rtol=1e-4)
 
 
 def test_boundary_loss_of_a_known_offset():
-    assert Residuals(512)(Known(offset=0.1))["boundary_loss"] == pytest.approx(0.01, rel=1e-3)
+    assert measure(Residuals(512), Known(offset=0.1))["boundary_loss"] == pytest.approx(0.01, rel=1e-3)
 
 
 def one_step_variance(dt: float, points: int = 200, nodes: int = 161) -> float:
@@ -162,19 +180,19 @@ def one_step_variance(dt: float, points: int = 200, nodes: int = 161) -> float:
 @pytest.mark.parametrize("dt", [0.1, 0.02])
 def test_td_loss_of_the_exact_value_is_the_variance_of_a_step(dt):
     """16,384 transitions estimate it with a deviation of 2% (dt = 0.1) and 4% (dt = 0.02)."""
-    assert Residuals(16_384, dt=dt)(Known())["td_loss"] == pytest.approx(one_step_variance(dt), rel=0.12)
+    assert measure(Residuals(16_384), Known(), dt=dt)["td_loss"] == pytest.approx(one_step_variance(dt), rel=0.12)
 
 
 def test_td_loss_sees_a_wrong_value():
     """An offset c of V stays in the error of the steps that end an episode, and only there."""
-    exact, wrong = (Residuals(16_384)(Known(offset=offset))["td_loss"] for offset in (0.0, 0.3))
+    exact, wrong = (measure(Residuals(16_384), Known(offset=offset))["td_loss"] for offset in (0.0, 0.3))
     assert exact + 0.3**2 * 0.05 < wrong < exact + 0.3**2 * 0.5
 
 
 def test_calibration_of_the_exact_value_is_its_noise():
-    metrics = Calibration(256, 256)(Known())
+    metrics = measure(Calibration(256, 256), Known())
     assert metrics["calibration_mse"] == pytest.approx(metrics["calibration_noise"], rel=0.4)
-    worse = Calibration(256, 256)(Known(offset=0.1))
+    worse = measure(Calibration(256, 256), Known(offset=0.1))
     assert worse["calibration_mse"] == pytest.approx(0.01 + metrics["calibration_noise"], rel=0.2)
     assert worse["calibration_mae"] == pytest.approx(0.1, rel=0.1)
 
@@ -185,7 +203,7 @@ def test_success_rate_of_constant_controls():
     evaluator = Success(20_000, initial_states=start)
     for u in (1.0, -1.0):
         exact = first_passage(torch.tensor([2.0]), torch.zeros(1, 1), u).item()
-        metrics = evaluator(Known(u))
+        metrics = measure(evaluator, Known(u))
         assert metrics["success_rate"] == pytest.approx(exact, abs=4 * math.sqrt(exact * (1 - exact) / 20_000))
         assert metrics["success_low"] < metrics["success_rate"] < metrics["success_high"]
         assert metrics["reward"] == metrics["success_rate"]
@@ -195,7 +213,7 @@ def test_success_rate_of_constant_controls():
 def test_success_watched_at_end_points_only():
     """Twenty steps of 0.1 s watched at their ends hit with probability 0.5772, a known number."""
     start = UniformStates([-1e-6], [1e-6], tau="fixed")
-    metrics = Success(20_000, crossing="endpoint", initial_states=start)(Known())
+    metrics = measure(Success(20_000, initial_states=start), Known(), crossing="endpoint")
     assert metrics["success_rate"] == pytest.approx(0.5772, abs=0.014)
 
 
@@ -203,8 +221,8 @@ def test_success_of_a_smoothed_payoff_counts_the_hard_target():
     smooth = Known()
     smooth.problem = Reach1D(LipschitzPayoff(0.5))
     hard, soft = (
-        Success(5_000, initial_states=UniformStates([-2.0], [1.8]))(Known()),
-        Success(5_000, initial_states=UniformStates([-2.0], [1.8]))(smooth),
+        measure(Success(5_000, initial_states=UniformStates([-2.0], [1.8])), Known()),
+        measure(Success(5_000, initial_states=UniformStates([-2.0], [1.8])), smooth),
     )
     assert soft["success_rate"] == hard["success_rate"]
     assert soft["reward"] < hard["reward"]
@@ -212,20 +230,62 @@ def test_success_of_a_smoothed_payoff_counts_the_hard_target():
 
 def test_evaluation_repeats_and_leaves_torch_alone(network):
     before = torch.get_rng_state()
-    first, again = evaluate(network, EVALUATORS), evaluate(network, EVALUATORS)
+    simulator = Simulator(network.problem)
+    first, again = (metrics_of(evaluate(network, simulator, EVALUATORS)) for _ in range(2))
     assert torch.equal(torch.get_rng_state(), before)
     assert first == again
     assert all(type(value) is float and math.isfinite(value) for value in first.values())
-    assert set(first) <= set(METRICS)
 
 
-def test_every_metric_is_documented_and_made():
-    """Those of the reference states and of planes are checked beside their evaluators."""
+def reference_states(problem) -> ReferenceStates:
+    """Around uniform states of the box."""
+    rng = torch.Generator().manual_seed(2)
+    tau, x = problem.horizon * torch.rand(50, generator=rng), problem.states.sample(50, rng)
+    box = Box([0.0, *problem.states.low], [problem.horizon, *problem.states.high])
+    return ReferenceStates.from_visited(problem, tau, x, box, rng, count=50)
+
+
+@pytest.mark.parametrize("name", problems.__all__)
+def test_every_metric_has_a_meaning_of_its_own_for_every_problem(name):
+    """The texts are whole sentences, hold the evaluators' own sizes, and know nothing of any one problem."""
     torch.manual_seed(0)
-    problem = Reach1D()
-    solution = Solution(PIRLLoss(problem, Actor(problem), [Critic(problem), Critic(problem)]))
-    others = {name for name in METRICS if name.startswith(("fine_", "paper_", "slice_"))}
-    assert set(evaluate(solution, EVALUATORS)) == set(METRICS) - others
+    problem = getattr(problems, name)()
+    solution = Solution(problem, Actor(problem), stack([Critic(problem)]))
+    evaluators = {
+        "exact": ExactError(7, 9),
+        "calibration": Calibration(12, 3),
+        "success": Success(41),
+        "residuals": Residuals(34),
+        "on_states": Residuals(34, lambda: reference_states(problem)),
+        "accuracy": Accuracy(lambda: reference_states(problem), 5),
+        "slices": Slices(6, 2),
+        "rollouts": Rollouts(2, 6),
+    }
+    simulator, sizes = Simulator(problem, problem.horizon / 4), set()
+    for evaluator in evaluators.values():
+        meanings = evaluator.meanings(problem)
+        assert list(evaluator(solution, simulator).metrics()) == list(meanings)
+        sizes |= {word for text in meanings.values() for word in text.replace(",", " ").split() if word.isdigit()}
+    assert {"12", "3", "41", "34", "5"} <= sizes
+    meanings = meanings_of(evaluators, problem)
+    assert set(metrics_of(evaluate(solution, simulator, evaluators))) == set(meanings)
+    for text in meanings.values():
+        assert text[0].isupper()
+        assert text.endswith(".")
+        assert not {"drift", "friction", "car", "vehicle"} & set(text.lower().replace(".", " ").split())
+
+
+def test_meanings_follow_the_problem_and_the_arguments():
+    assert "101 x 201 grid" in ExactError().meanings(Reach1D())["value_mse"]
+    assert ExactError().meanings(Safety1D()) == {}
+    assert "reach A before B" in Success().meanings(Reach1D())["success_rate"]
+    assert "stay out of B" in Success().meanings(Safety1D())["success_rate"]
+    assert "optimal_reward" not in Success().meanings(problems.VehicleDrift())
+    simulators = {"coarse": {"dt": 0.2, "substeps": 2, "crossing": "bridge"}}
+    meanings = Accuracy(lambda: reference_states(Reach1D()), 17, simulators).meanings(Reach1D())
+    assert all(name.startswith("coarse_") for name in meanings)
+    assert "17 rollouts" in meanings["coarse_mse"]
+    assert "control steps of 0.2 s, integration steps of 0.1 s and the exit rule bridge" in meanings["coarse_mse"]
 
 
 @pytest.mark.parametrize(
@@ -253,5 +313,5 @@ def test_starts_and_noise_are_independent():
     x = torch.linspace(-2, 2, 4_001, dtype=torch.float64)[:-1, None] + 5e-4
     taus = [torch.full((len(x),), 0.1 * k, dtype=torch.float64) for k in range(1, 21)]
     exact = torch.stack([problem.exact_value(tau, x).mean() for tau in taus]).mean().item()
-    rate = Success(episodes=count)(InSinglePrecision())["success_rate"]
+    rate = measure(Success(episodes=count), InSinglePrecision())["success_rate"]
     assert rate == pytest.approx(exact, abs=4 * (exact * (1 - exact) / count) ** 0.5)

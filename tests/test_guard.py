@@ -204,9 +204,9 @@ def test_a_guard_without_evaluations_is_refused(setting, tmp_path):
 
 def test_success_measures_the_spread_of_a_known_value(tmp_path):
     trainer = small_trainer(tmp_path, *GUARDED, SOUND)
-    [success] = trainer.during
+    [success] = trainer.during.values()
     solution = trainer.solution
     solution.raw_value = lambda tau, x: torch.where(x[:, 0] > 0, 5.0, -5.0)  # starts are uniform: half of each sign
-    assert success(solution)["value_spread"] == pytest.approx(0.5, abs=0.01)
+    assert success(solution, trainer.simulator).metrics()["value_spread"] == pytest.approx(0.5, abs=0.01)
     solution.raw_value = lambda tau, x: torch.full_like(tau, 0.3)
-    assert success(solution)["value_spread"] == pytest.approx(0, abs=1e-6)
+    assert success(solution, trainer.simulator).metrics()["value_spread"] == pytest.approx(0, abs=1e-6)

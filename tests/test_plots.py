@@ -10,10 +10,14 @@ import pytest
 import torch
 from matplotlib.image import imread
 
-from pirl_rl import compare, plots
-from pirl_rl.losses import PIRLLoss
-from pirl_rl.networks import Actor, Critic
+from pirl_rl.figures.comparison import draw_comparison
+from pirl_rl.figures.one_dimensional import draw_value, solve_on_grid
+from pirl_rl.figures.run import draw_run
+from pirl_rl.figures.training import HELD_OUT, TRAINING, WEIGHTS, draw_training
+from pirl_rl.loggers import read_metrics
+from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.problems import Reach1D, Safety1D
+from pirl_rl.runs import compare
 from pirl_rl.sets import Box
 from pirl_rl.solution import Solution
 
@@ -29,18 +33,18 @@ class Plane(Reach1D):
 
 def random_solution(problem) -> Solution:
     torch.manual_seed(0)
-    return Solution(PIRLLoss(problem, Actor(problem), [Critic(problem), Critic(problem)]))
+    return Solution(problem, Actor(problem), stack([Critic(problem, action_input=True) for _ in range(2)]))
 
 
 def write_metrics(path, scale: float = 1.0) -> None:
     """Rows every 10 updates, held-out losses every 20."""
-    names = ["update", *plots.WEIGHTS, *plots.TRAINING, *plots.HELD_OUT]
+    names = ["update", *WEIGHTS, *TRAINING, *HELD_OUT]
     with open(path, "w", newline="") as file:
         writer = csv.DictWriter(file, names)
         writer.writeheader()
         for update in range(0, 100, 10):
-            row = {"update": update} | dict.fromkeys([*plots.WEIGHTS, *plots.TRAINING], scale)
-            writer.writerow(row | (dict.fromkeys(plots.HELD_OUT, scale / (1 + update)) if update % 20 == 0 else {}))
+            row = {"update": update} | dict.fromkeys([*WEIGHTS, *TRAINING], scale)
+            writer.writerow(row | (dict.fromkeys(HELD_OUT, scale / (1 + update)) if update % 20 == 0 else {}))
 
 
 @pytest.fixture
@@ -59,7 +63,7 @@ def metrics_path(tmp_path):
     ids=["reach1d", "safety1d", "plane"],
 )
 def test_draw_run_writes_readable_figures(problem, names, metrics_path, tmp_path):
-    paths = plots.draw_run(random_solution(problem), metrics_path, tmp_path / "figures")
+    paths = draw_run(random_solution(problem), metrics_path, tmp_path / "figures")
     assert [path.name for path in paths] == [f"{name}.png" for name in names]
     for path in paths:
         assert imread(path)[..., :3].std() > 0.01
@@ -67,7 +71,7 @@ def test_draw_run_writes_readable_figures(problem, names, metrics_path, tmp_path
 
 def test_grid_holds_values_where_it_says():
     solution = random_solution(Reach1D())
-    grid = plots.solve_on_grid(solution, taus=5, states=9)
+    grid = solve_on_grid(solution, taus=5, states=9)
     tau, x = torch.tensor([grid.tau[3]]).float(), torch.tensor([[grid.x[7]]]).float()
     assert grid.value[7, 3] == pytest.approx(solution.raw_value(tau, x).item(), abs=1e-6)
     assert grid.control[0, 7, 3] == pytest.approx(solution.policy(tau, x).item(), abs=1e-6)
@@ -75,18 +79,18 @@ def test_grid_holds_values_where_it_says():
 
 
 def test_value_maps_share_limits_and_are_labelled():
-    figure = plots.draw_value(plots.solve_on_grid(random_solution(Reach1D()), 21, 21))
+    figure = draw_value(solve_on_grid(random_solution(Reach1D()), 21, 21))
     learned, exact, error = (axes for axes in figure.axes if axes.get_title())
     assert [axes.get_title().split(",")[0] for axes in (learned, exact, error)] == ["Learned V", "Exact V", "|error|"]
     assert learned.collections[0].get_clim() == exact.collections[0].get_clim() == (0, 1)
     assert all("(s)" in axes.get_xlabel() for axes in (learned, exact, error))
-    assert len(plots.draw_value(plots.solve_on_grid(random_solution(Safety1D()), 21, 21)).axes) == 2
+    assert len(draw_value(solve_on_grid(random_solution(Safety1D()), 21, 21)).axes) == 2
 
 
 def test_training_curves_skip_empty_cells(metrics_path):
-    metrics = plots.read_metrics(metrics_path)
+    metrics = read_metrics(metrics_path)
     assert np.isnan(metrics["td_loss"]).sum() == 5
-    top, middle, bottom = plots.draw_training(metrics).axes
+    top, middle, bottom = draw_training(metrics).axes
     assert [len(axes.lines) for axes in (top, middle, bottom)] == [3, 5, 3]
     assert list(middle.lines[0].get_xdata()) == [0, 20, 40, 60, 80]
     assert top.get_yscale() == middle.get_yscale() == "log"
@@ -124,7 +128,7 @@ def test_compare_writes_table_and_figure(runs, tmp_path, capsys):
 
 
 def test_compare_draws_median_and_range(runs):
-    figure = compare.draw(compare.find_runs([runs]))
+    figure = draw_comparison(compare.find_runs([runs]))
     axes = next(axes for axes in figure.axes if axes.get_title() == "Held-out td_loss")
     assert axes.lines[0].get_ydata()[0] == 2
     heights = axes.collections[0].get_paths()[0].vertices[:, 1]
@@ -135,7 +139,7 @@ def test_compare_draws_runs_without_exact_value(tmp_path):
     """A log axis cannot be drawn without a positive value: the panels say so instead."""
     make_run(tmp_path, "td3", 0, reward=0.3)
     write_metrics(tmp_path / "td3-0" / "metrics.csv", scale=0.0)
-    figure = compare.draw(compare.find_runs([tmp_path]))
+    figure = draw_comparison(compare.find_runs([tmp_path]))
     figure.savefig(tmp_path / "comparison.png")
     assert sum(text.get_text() == "not available" for axes in figure.axes for text in axes.texts) == 6
 

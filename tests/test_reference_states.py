@@ -7,12 +7,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from pirl_rl import runs
 from pirl_rl.errors import ConfigError
 from pirl_rl.evaluation.reference_states import ReferenceStates, displaced, visited_by
 from pirl_rl.evaluation.trajectories import closed_loop
 from pirl_rl.problems import Reach1D, VehicleDrift
 from pirl_rl.problems.drift.reference_states import FILE, NETWORK_BOX, DriftStates, drift_states
+from pirl_rl.runs import load
 from pirl_rl.sampling.initial_states import UniformStates
 from pirl_rl.sets import Box
 from pirl_rl.simulator import Simulator
@@ -127,15 +127,15 @@ def test_what_is_saved_is_loaded(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"neighbours": 61}, "neighbours: expected 1 to 60"),
         ({"box": Box([0], [1])}, "box: expected 2 axes, tau first, got 1"),
     ],
 )
-def test_wrong_arguments_are_named(change, told):
+def test_wrong_arguments_are_named(change, message):
     tau, x = visited()
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=message):
         ReferenceStates.from_visited(Reach1D(), tau, x, **{"box": BOX, "rng": torch.Generator()} | change)
 
 
@@ -159,7 +159,7 @@ def test_states_of_another_run(monkeypatch):
     """The recipe with the run's own policy, and only for runs of the same problem."""
     problem = VehicleDrift()
     opened = SimpleNamespace(problem=problem, solution=SimpleNamespace(policy=hold))
-    monkeypatch.setattr(runs, "load_run", lambda folder: opened)
+    monkeypatch.setattr(load, "load_run", lambda folder: opened)
     states = DriftStates("some/run")()
     assert torch.equal(states.x, drift_states(hold).x)
     assert 400 <= len(states.x) < 512

@@ -9,12 +9,13 @@ import pytest
 import torch
 from matplotlib.image import imread
 
-from pirl_rl import plots
-from pirl_rl.evaluation import METRICS, Rollouts, Slices
+from pirl_rl.evaluation import Rollouts, Slices, evaluate
 from pirl_rl.evaluation.slices import Section, projected_field
+from pirl_rl.figures import draw, draw_run
 from pirl_rl.problems import Reach1D, VehicleDrift
 from pirl_rl.problems.drift.equilibria import equilibrium
 from pirl_rl.sets import Box, Plane
+from pirl_rl.simulator import Simulator
 
 
 class Walk(Reach1D):
@@ -61,8 +62,9 @@ def test_slice_of_the_exact_value():
     """Mean |MC - V| of a mean of k draws of variance s^2 is about s sqrt(2/(pi k)); the mean over 15 x 15 states is
     known to 4 standard errors."""
     rollouts = 400
-    evaluator = Slices(15, rollouts, dt=0.1, substeps=1, crossing="bridge")
-    numbers = evaluator(Known(Walk()))
+    solution = Known(Walk())
+    evidence = Slices(15, rollouts)(solution, Simulator(solution.problem, dt=0.1, substeps=1, crossing="bridge"))
+    numbers = evidence.metrics()
     assert set(numbers) == {"slice_walk_angle_mae", "slice_walk_angle_success"}
     x = torch.linspace(-2, 2.5, 15, dtype=torch.float64)
     exact = Reach1D().exact_value(torch.full_like(x, 2.0), x.unsqueeze(-1))
@@ -73,7 +75,7 @@ def test_slice_of_the_exact_value():
     error = (spread.square().mean().item() / (15 * 15 * rollouts)) ** 0.5
     assert numbers["slice_walk_angle_success"] == pytest.approx(exact.mean().item(), abs=4 * error)
     # The first axis runs along the rows; states in the target need no paths.
-    cut = evaluator.evidence.slices["walk_angle"]
+    cut = evidence.slices["walk_angle"]
     assert torch.allclose(cut.section.value[4], exact)
     assert (cut.monte_carlo[:, x >= 2] == 1).all()
 
@@ -126,9 +128,10 @@ def test_field_at_the_drift_equilibrium_vanishes():
 
 @pytest.fixture(scope="module")
 def measured():
-    evaluator = Rollouts(paths=4, points=41, dt=0.1, substeps=1)
-    assert evaluator(Known(Walk())) == {}
-    return evaluator.evidence
+    simulator = Simulator(Walk(), dt=0.1, substeps=1, crossing="endpoint")
+    evidence = Rollouts(paths=4, points=41)(Known(Walk()), simulator)
+    assert evidence.metrics() == {}
+    return evidence
 
 
 def test_rollouts_start_where_the_value_is_asked_for(measured):
@@ -142,7 +145,7 @@ def test_rollouts_start_where_the_value_is_asked_for(measured):
 
 
 def test_rollouts_are_drawn_to_their_ends(measured):
-    axes = measured.figures()["rollouts"].axes[0]
+    axes = draw(measured)["rollouts"].axes[0]
     paths, markers = [], []
     for line in axes.lines:
         (paths if line.get_marker() == "None" else markers).append(line.get_xydata())
@@ -154,24 +157,27 @@ def test_rollouts_are_drawn_to_their_ends(measured):
 def test_a_problem_without_planes_has_nothing_to_show():
     solution = Known(Reach1D())
     for evaluator in (Slices(3, 1), Rollouts(1, 3)):
-        assert evaluator(solution) == {}
-        assert evaluator.evidence.figures() == {}
+        evidence = evaluator(solution, Simulator(solution.problem))
+        assert evidence.metrics() == {}
+        assert draw(evidence) == {}
 
 
 def test_evidence_is_among_the_figures_of_a_run(tmp_path):
-    evaluators = [Slices(5, 2), Rollouts(2, 5)]
     solution = Known(Walk())
-    for evaluator in evaluators:
-        evaluator(solution)
-    paths = plots.draw_run(solution, tmp_path / "none.csv", tmp_path / "figures", evaluators)
+    simulator = Simulator(solution.problem, dt=0.1, substeps=10, crossing="endpoint")
+    evidence = evaluate(solution, simulator, {"slices": Slices(5, 2), "rollouts": Rollouts(2, 5)})
+    paths = draw_run(solution, tmp_path / "none.csv", tmp_path / "figures", evidence)
     assert [path.name for path in paths] == ["slice_walk_angle.png", "rollouts.png"]
     assert all(imread(path)[..., :3].std() > 0.01 for path in paths)
 
 
-def test_every_number_of_the_drifting_problem_is_documented():
-    planes = VehicleDrift().planes
-    numbers = {f"slice_{plane}_{name}" for plane in planes for name in ("mae", "success")}
-    assert numbers == {name for name in METRICS if name.startswith("slice_")}
+def test_every_metric_of_the_drifting_problem_has_a_meaning():
+    problem = VehicleDrift()
+    meanings = Slices(31, 64).meanings(problem)
+    assert list(problem.planes) == ["beta_r", "e_y_e_psi"]
+    assert set(meanings) == {f"slice_{plane}_{name}" for plane in problem.planes for name in ("mae", "success")}
+    assert "31 x 31 grid of the plane beta_r" in meanings["slice_beta_r_mae"]
+    assert Rollouts().meanings(problem) == Slices().meanings(Reach1D()) == {}
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ from matplotlib.image import imread
 from omegaconf import OmegaConf
 from small import QUICK, command
 
-from pirl_rl import sweeps
 from pirl_rl.errors import RunError
+from pirl_rl.runs import sweeps
 
 CENTERS, STEEP = ("1e3", "2e3", "4000", "8e3", "16e3"), ("1e-4", "3e-4", "0.001", "3e-3", "1e-2")
 
@@ -67,7 +67,7 @@ def test_two_settings_make_a_table_and_a_heat_map(square, tmp_path, capsys):
 
 
 def test_the_heat_map_shows_what_the_table_says(square):
-    figure = sweeps.draw(sweeps.gather(sweeps.find_jobs(square), "value_mse"))
+    figure = sweeps.draw_sweep(sweeps.gather(sweeps.find_jobs(square), "value_mse"))
     panel = figure.axes[0]
     assert (panel.get_ylabel(), panel.get_xlabel()) == ("schedule.center", "schedule.steepness")
     shown = panel.images[0].get_array()
@@ -75,7 +75,7 @@ def test_the_heat_map_shows_what_the_table_says(square):
     assert shown[1, 2] == pytest.approx(1.1 * mse(1, 2))
     assert isinstance(panel.images[0].norm, LogNorm)
     assert {"failed", "missing", f"{1.1 * mse(1, 2):.2e}"} <= {text.get_text() for text in panel.texts}
-    reward = sweeps.draw(sweeps.gather(sweeps.find_jobs(square), "reward")).axes[0].images[0]
+    reward = sweeps.draw_sweep(sweeps.gather(sweeps.find_jobs(square), "reward")).axes[0].images[0]
     assert type(reward.norm) is Normalize
 
 
@@ -86,7 +86,7 @@ def test_one_setting_makes_a_line(tmp_path):
             job(tmp_path, {"loss.weight": weight, "seed": str(seed)}, **summary)
     sweeps.main([str(tmp_path)])
     assert cells((tmp_path / "sweep.md").read_text())[2:] == [["0.1", "1.00e+00"], ["1", "1.00e-01"], ["10", "failed"]]
-    panel = sweeps.draw(sweeps.gather(sweeps.find_jobs(tmp_path), "value_mse")).axes[0]
+    panel = sweeps.draw_sweep(sweeps.gather(sweeps.find_jobs(tmp_path), "value_mse")).axes[0]
     assert (panel.get_xlabel(), panel.get_ylabel()) == ("loss.weight", "value_mse")
     assert (panel.get_xscale(), panel.get_yscale()) == ("log", "log")
     np.testing.assert_allclose(panel.lines[-1].get_data(), ([0.1, 1, 10], [1, 0.1, np.nan]))
@@ -115,7 +115,7 @@ def test_three_settings_need_a_choice(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("settings", "metric", "axes", "told"),
+    ("settings", "metric", "axes", "message"),
     [
         ({"a": "1"}, "value_mse", (), "got 0"),
         ({"a": "1"}, "nope", (), "metric: expected one of value_mse, got nope"),
@@ -123,13 +123,13 @@ def test_three_settings_need_a_choice(tmp_path, capsys):
         ({"a": "1", "b": "1", "c": "1"}, "value_mse", ("a", "b", "c"), "expected one or two"),
     ],
 )
-def test_mistakes_are_named(settings, metric, axes, told, tmp_path):
+def test_mistakes_are_named(settings, metric, axes, message, tmp_path):
     job(tmp_path, settings, value_mse=1.0)
-    with pytest.raises(RunError, match=told):
+    with pytest.raises(RunError, match=message):
         sweeps.gather(sweeps.find_jobs(tmp_path), metric, axes)
 
 
-def test_no_runs_and_broken_ones_are_told(tmp_path, capsys):
+def test_no_runs_and_broken_ones_are_reported(tmp_path, capsys):
     with pytest.raises(SystemExit):
         sweeps.main([str(tmp_path / "nothing")])
     assert "no runs found below" in capsys.readouterr().err

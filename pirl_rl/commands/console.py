@@ -15,7 +15,6 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from pirl_rl.errors import CheckpointError, CollectorError, ConfigError, DivergenceError, Interrupted, ProblemError
-from pirl_rl.evaluation import METRICS
 
 EXPECTED = (
     ConfigError,
@@ -36,12 +35,12 @@ def quiet_libraries() -> None:
     warnings.filterwarnings("ignore", category=FutureWarning, module=r"(torch|tensordict|torchrl)\b")
 
 
-def table(summary: Mapping[str, float]) -> str:
-    """Metrics with their meanings."""
-    rows = [
-        f"{name:<20} {value:>12.5g}   {textwrap.shorten(METRICS.get(name, ''), 84, placeholder=' ...')}"
-        for name, value in summary.items()
-    ]
+def table(summary: Mapping[str, float], meanings: Mapping[str, str]) -> str:
+    """The numbers of a summary with the meanings of those that are metrics."""
+    rows = []
+    for name, value in summary.items():
+        first, *others = textwrap.wrap(meanings.get(name, ""), 84) or [""]
+        rows += [f"{name:<20} {value:>12.5g}   {first}".rstrip(), *(f"{'':<36}{line}" for line in others)]
     return "\n".join(["", f"{'metric':<20} {'value':>12}   meaning", "-" * 120, *rows, ""])
 
 

@@ -11,12 +11,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from pirl_rl.assembly import make_evaluators
+from pirl_rl.assembly import make_evaluators, make_simulator
 from pirl_rl.commands.console import named_modules, override, table, told
 from pirl_rl.configuration import load_config
 from pirl_rl.errors import ConfigError
-from pirl_rl.evaluation import evaluate
-from pirl_rl.figures.run import FIGURES, draw_run
+from pirl_rl.evaluation import evaluate, meanings_of, metrics_of
+from pirl_rl.figures import FIGURES, draw_run
 from pirl_rl.files import replacing
 from pirl_rl.loggers import METRICS_FILE
 from pirl_rl.runs.load import load_run, refuse_links
@@ -40,11 +40,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         evaluators = make_evaluators(config.evaluation, "final", trust)
         solution = load_run(folder, trust, device=config.device).solution
         refuse_links(folder)
-        metrics = evaluate(solution, evaluators)
+        evidence = evaluate(solution, make_simulator(config.evaluation, solution.problem), evaluators)
+        metrics = metrics_of(evidence)
         with replacing(folder / RESULTS) as file:
             file.write(json.dumps(metrics, indent=2) + "\n")
-        figures = draw_run(solution, folder / METRICS_FILE, folder / FIGURES, evaluators)
-    print(table(metrics))
+        figures = draw_run(solution, folder / METRICS_FILE, folder / FIGURES, evidence)
+    print(table(metrics, meanings_of(evaluators, solution.problem)))
     for figure in figures:
         print(f"figure   {figure}")
     print(f"written  {folder / RESULTS}")

@@ -17,7 +17,7 @@ from pirl_rl.commands.console import told
 from pirl_rl.commands.evaluate import RESULTS
 from pirl_rl.configuration import load_config, save_config
 from pirl_rl.errors import ConfigError
-from pirl_rl.figures.run import FIGURES
+from pirl_rl.figures import FIGURES
 from pirl_rl.loggers import METRICS_FILE
 from pirl_rl.runs.load import refuse_links
 

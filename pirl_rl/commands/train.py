@@ -22,7 +22,8 @@ from pirl_rl.commands.console import INTERRUPTED, named_modules, override, quiet
 from pirl_rl.commands.methods import check_method
 from pirl_rl.configuration import CONF, load_config, save_config
 from pirl_rl.errors import ConfigError
-from pirl_rl.figures.run import FIGURES, draw_run
+from pirl_rl.evaluation import meanings_of
+from pirl_rl.figures import FIGURES, draw_run
 from pirl_rl.loggers import METRICS_FILE
 from pirl_rl.runs.load import refuse_links
 from pirl_rl.trainer import Trainer
@@ -69,8 +70,8 @@ def _train(trainer: Trainer) -> dict[str, float]:
     summary = trainer.train()
     folder = trainer.folder
     assert folder is not None
-    print(table(summary))
-    for figure in draw_run(trainer.solution, folder / METRICS_FILE, folder / FIGURES, trainer.final):
+    print(table(summary, meanings_of(trainer.final, trainer.solution.problem)))
+    for figure in draw_run(trainer.solution, folder / METRICS_FILE, folder / FIGURES, trainer.evidence):
         print(f"figure   {figure}")
     print(f"run      {folder}")
     return summary

@@ -6,15 +6,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from pirl_rl.errors import ArgumentError
-from pirl_rl.evaluation.evidence import Measurement, like, rng_like
-from pirl_rl.evaluation.monte_carlo import mean_payoff
+from pirl_rl.evaluation.inputs import like
 from pirl_rl.evaluation.reference_states import GROUPS, ReferenceStates
-from pirl_rl.figures.evidence import draw_accuracy
+from pirl_rl.evaluation.rollout_comparison import RolloutComparison
+from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
@@ -25,68 +23,50 @@ SIMULATORS: dict[str, dict[str, Any]] = {
 LEVELS = (0.1, 0.5, 0.9)
 """p of the sets {V > p}."""
 
-MEANINGS = {
-    "mse": "mean square of masked V minus Monte Carlo of the learned policy on the reference states, 256 paths each",
-    "mae": "mean absolute value of the same difference",
-    "noise": "the mean square that a perfect V would have there: the variance of the Monte Carlo mean",
-    "raw_mse": "as mse, of the raw network's V",
-    "mse_band": "as mse, over the states from which the target can be reached (drift: friction inside the band)",
-    **{f"mse_{group}": f"as mse, over fifth {i + 1} of the states by distance" for i, group in enumerate(GROUPS)},
-    "success": "mean of that Monte Carlo over the reference states",
-    "success_band": "the same over the states from which the target can be reached",
-    **{f"precision_p{100 * p:.0f}": f"share of states with V > {p} that Monte Carlo > {p} confirms" for p in LEVELS},
-    **{f"recall_p{100 * p:.0f}": f"share of states with Monte Carlo > {p} that V > {p} finds" for p in LEVELS},
-}
-"""Each with the name of a simulator before it."""
-
 
 @dataclass(frozen=True)
 class AccuracyEvidence:
-    """On N reference states: V (N,) masked and raw, which of them can reach the target, (N,) bool, and by simulator
-    the mean payoff (N,) of `rollouts` paths each, float64, all on the CPU."""
+    """V and Monte Carlo on N reference states.
+
+    Attributes:
+        states: the reference states.
+        reachable: those from which the target can be reached as far as the problem knows, (N,) bool, on the CPU.
+        comparisons: by the name of the simulator.
+    """
 
     states: ReferenceStates
-    value: Tensor
-    raw_value: Tensor
     reachable: Tensor
-    monte_carlo: dict[str, Tensor]
-    rollouts: int
+    comparisons: Mapping[str, RolloutComparison]
 
-    def numbers(self) -> dict[str, float]:
-        return {f"{name}_{key}": value for name in self.monte_carlo for key, value in self.numbers_of(name).items()}
+    def metrics(self) -> dict[str, float]:
+        return {f"{name}_{key}": value for name in self.comparisons for key, value in self.metrics_under(name).items()}
 
-    def numbers_of(self, simulator: str) -> dict[str, float]:
-        """The metrics of one simulator, named as in `MEANINGS`."""
-        mean, band = self.monte_carlo[simulator], self.reachable
-        error = self.value - mean
-        square = error.square()
-        numbers = {
-            "mse": square.mean(),
-            "mae": error.abs().mean(),
-            "noise": (mean * (1 - mean)).mean() / (self.rollouts - 1),
-            "raw_mse": (self.raw_value - mean).square().mean(),
-            "mse_band": square[band].mean(),
-            **{f"mse_{group}": square[self.states.group == i].mean() for i, group in enumerate(GROUPS)},
-            "success": mean.mean(),
-            "success_band": mean[band].mean(),
+    def metrics_under(self, simulator: str) -> dict[str, float]:
+        """The metrics of one simulator, without its name before theirs."""
+        one = self.comparisons[simulator]
+        metrics = {
+            "mse": one.mse(),
+            "mae": one.mae(),
+            "noise": one.noise(),
+            "raw_mse": one.raw_mse(),
+            "mse_band": one.mse(self.reachable),
+            **{f"mse_{group}": one.mse(self.states.group == i) for i, group in enumerate(GROUPS)},
+            "success": one.monte_carlo.mean().item(),
+            "success_band": one.monte_carlo[self.reachable].mean().item(),
         }
         for p in LEVELS:
-            claimed, true = self.value > p, mean > p
-            numbers[f"precision_p{100 * p:.0f}"] = _share(claimed & true, claimed)
-            numbers[f"recall_p{100 * p:.0f}"] = _share(claimed & true, true)
-        return {name: value.item() for name, value in numbers.items()}
-
-    def figures(self) -> dict[str, Figure]:
-        return {"accuracy": draw_accuracy(self)}
+            metrics[f"precision_p{100 * p:.0f}"] = one.precision(p)
+            metrics[f"recall_p{100 * p:.0f}"] = one.recall(p)
+        return metrics
 
 
-class Accuracy(Measurement):
-    """V against the mean payoff of noise-free rollouts on the same states for every solution, under several simulators.
+class Accuracy:
+    """V against the mean payoff of rollouts on the same states for every solution, under several simulators of its own.
 
     Args:
         states: gives the reference states.
         rollouts: paths from each, at least 2.
-        simulators: dt, substeps and crossing of each, by the name that its metrics begin with; default `SIMULATORS`.
+        simulators: dt, substeps and crossing of each, by the name that its metrics start with; default `SIMULATORS`.
         seed: of the noise.
     """
 
@@ -101,17 +81,42 @@ class Accuracy(Measurement):
             raise ArgumentError(f"Accuracy: expected rollouts >= 2, got {rollouts}")
         self.states, self.rollouts, self.simulators, self.seed = states, rollouts, simulators or SIMULATORS, seed
 
-    def measure(self, solution: Solution) -> AccuracyEvidence:
+    def meanings(self, problem: ReachAvoidProblem) -> dict[str, str]:
+        return {
+            f"{name}_{key}": text
+            for name, settings in self.simulators.items()
+            for key, text in self._meanings_under(name, Simulator(problem, **settings)).items()
+        }
+
+    def _meanings_under(self, name: str, simulator: Simulator) -> dict[str, str]:
+        meanings = {
+            "mse": f"The mean square of V minus Monte Carlo, the mean payoff of {self.rollouts:,} rollouts of the "
+            f"learned policy from each reference state, with control steps of {simulator.dt:g} s, integration steps of "
+            f"{simulator.dt / simulator.substeps:g} s and the exit rule {simulator.crossing}; V is 1 in A and 0 in B.",
+            "mae": f"The mean absolute value of the difference in {name}_mse.",
+            "noise": f"The {name}_mse that a perfect V would have: the variance of the Monte Carlo means.",
+            "raw_mse": f"As {name}_mse, for the networks' own V.",
+            "mse_band": f"As {name}_mse, over the states from which the problem does not rule the target out.",
+            **{
+                f"mse_{group}": f"As {name}_mse, over group {i + 1} of {len(GROUPS)} of the reference states, counted "
+                "from the closest to those that a reference policy visits."
+                for i, group in enumerate(GROUPS)
+            },
+            "success": f"The mean over the reference states of the Monte Carlo in {name}_mse.",
+            "success_band": f"As {name}_success, over the states from which the problem does not rule the target out.",
+        }
+        for p in LEVELS:
+            level = f"p{100 * p:.0f}"
+            meanings[f"precision_{level}"] = f"The share of the states with V > {p} whose Monte Carlo is above {p} too."
+            meanings[f"recall_{level}"] = f"The share of the states with Monte Carlo > {p} whose V is above {p} too."
+        return meanings
+
+    def __call__(self, solution: Solution, simulator: Simulator) -> AccuracyEvidence:
+        """Measure a solution under the evaluator's own simulators; the one that is handed to it is not used."""
         states, problem = self.states(), solution.problem
         tau, x = like(solution, states.tau, states.x)
-        means = {}
-        for name, settings in self.simulators.items():
-            simulator, noise = Simulator(problem, **settings), rng_like(solution, self.seed)
-            means[name] = mean_payoff(simulator, solution.policy, tau, x, self.rollouts, noise).cpu()
-        value, raw = (function(tau, x).cpu().double() for function in (solution.value, solution.raw_value))
-        return AccuracyEvidence(states, value, raw, ~problem.unreachable(x).cpu(), means, self.rollouts)
-
-
-def _share(part: Tensor, whole: Tensor) -> Tensor:
-    """Share of `whole` that is `part`, both bool; 1 of an empty one, where nothing is wrong."""
-    return part.double().sum() / whole.sum() if whole.any() else torch.ones(())
+        comparisons = {
+            name: RolloutComparison.measure(solution, Simulator(problem, **settings), tau, x, self.rollouts, self.seed)
+            for name, settings in self.simulators.items()
+        }
+        return AccuracyEvidence(states, ~problem.unreachable(x).cpu(), comparisons)

@@ -6,14 +6,18 @@ import torch
 from torch import Tensor
 
 from pirl_rl.errors import ArgumentError
+from pirl_rl.evaluation.evaluator import Metrics
+from pirl_rl.evaluation.inputs import like
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
 
 class ExactError:
     """Learned against exact V on the paper's grid: tau in [0, T] x states, tau = 0 and all edges included.
 
-    A problem of several dimensions has `tau_points * x_points` uniform points of the same box in its place.
+    A problem of several dimensions has `tau_points * x_points` uniform points of the same box in its place. A problem
+    whose exact V is not known has no metrics.
 
     Args:
         tau_points: grid points in tau.
@@ -26,20 +30,36 @@ class ExactError:
             raise ArgumentError(f"ExactError: expected tau_points, x_points >= 2, got {tau_points} and {x_points}")
         self.tau_points, self.x_points, self.seed = tau_points, x_points, seed
 
-    def __call__(self, solution: Solution) -> dict[str, float]:
-        """value_mse, value_max_error, masked_value_mse; nothing where no exact value is known."""
+    def meanings(self, problem: ReachAvoidProblem) -> dict[str, str]:
+        if problem.exact_value(*self._points(problem)) is None:
+            return {}
+        where = f"{self.tau_points * self.x_points:,} random points of tau in [0, T] and x in the box of states"
+        if problem.states.dim == 1:
+            where = (
+                f"the {self.tau_points} x {self.x_points} grid of tau in [0, T] and x in the box of states, edges "
+                "included"
+            )
+        return {
+            "value_mse": f"The mean square of the networks' own V minus the exact V, on {where}.",
+            "value_max_error": "The largest absolute error on the points of value_mse.",
+            "masked_value_mse": "As value_mse, with V set to 1 in A and to 0 in B.",
+        }
+
+    def __call__(self, solution: Solution, simulator: Simulator) -> Metrics:
         tau, x = self._points(solution.problem)
         exact = solution.problem.exact_value(tau, x)
         if exact is None:
-            return {}
-        inputs = tau.to(solution.device, solution.dtype), x.to(solution.device, solution.dtype)
+            return Metrics({})
+        inputs = like(solution, tau, x)
         raw = solution.raw_value(*inputs).cpu().double() - exact
         masked = solution.value(*inputs).cpu().double() - exact
-        return {
-            "value_mse": raw.square().mean().item(),
-            "value_max_error": raw.abs().max().item(),
-            "masked_value_mse": masked.square().mean().item(),
-        }
+        return Metrics(
+            {
+                "value_mse": raw.square().mean().item(),
+                "value_max_error": raw.abs().max().item(),
+                "masked_value_mse": masked.square().mean().item(),
+            }
+        )
 
     def _points(self, problem: ReachAvoidProblem) -> tuple[Tensor, Tensor]:
         """tau (N,) and x (N, n) in float64."""

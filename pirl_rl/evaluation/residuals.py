@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from pirl_rl.errors import ArgumentError
-from pirl_rl.evaluation.evidence import like, points_rng, rng_like
+from pirl_rl.evaluation.evaluator import Metrics
+from pirl_rl.evaluation.inputs import like, noise_rng, points_rng
 from pirl_rl.evaluation.reference_states import ReferenceStates
+from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.boundary import BoundarySampler
 from pirl_rl.sampling.collocation import Collocation
 from pirl_rl.sampling.initial_states import UniformStates
@@ -35,9 +35,6 @@ class Residuals:
         points: of each of the samples.
         states: gives reference states in place of the Sobol points, where most of the box is never visited.
         controls_per_axis: grid of the maximum, vertices included: this to the power m evaluations.
-        dt: control step of the transitions, s.
-        substeps: integration steps in it.
-        crossing: how exits are watched.
         seed: of points and noise.
     """
 
@@ -46,9 +43,6 @@ class Residuals:
         points: int = 4096,
         states: Callable[[], ReferenceStates] | None = None,
         controls_per_axis: int = 5,
-        dt: float = 0.1,
-        substeps: int = 1,
-        crossing: Literal["bridge", "endpoint"] = "bridge",
         seed: int = 0,
     ):
         if points < 2 or controls_per_axis < 2:
@@ -56,9 +50,22 @@ class Residuals:
                 f"Residuals: expected points, controls_per_axis >= 2, got {points}, {controls_per_axis}"
             )
         self.points, self.states, self.controls_per_axis, self.seed = points, states, controls_per_axis, seed
-        self.simulator = partial(Simulator, dt=dt, substeps=substeps, crossing=crossing)
 
-    def __call__(self, solution: Solution) -> dict[str, float]:
+    def meanings(self, problem: ReachAvoidProblem) -> dict[str, str]:
+        points = f"{self.points:,} held-out"
+        where = f"{points} Sobol points outside A and B" if self.states is None else "the reference states"
+        return {
+            "hjb_loss": f"The mean of (L^pi V)^2 in 1/s^2, at {where}: the networks' own V under its own policy.",
+            "hjb_sup_loss": "The mean of (max_u L^u V)^2 in 1/s^2, at the same points: the HJB equation itself.",
+            "boundary_loss": f"The mean of (V - l_eps)^2 at {points} points, half at tau = 0, half on the faces of A "
+            "and B, for the networks' own V.",
+            "td_loss": f"The mean of (V(y) - r - (1 - d) V(y'))^2 over {points} transitions of one control step, for "
+            "the networks' own V; it includes the variance of V(y').",
+            "value_slope": "The mean of |grad V| at the points of hjb_loss, in the coordinates in which the box of "
+            "states is [-1, 1]^n.",
+        }
+
+    def __call__(self, solution: Solution, simulator: Simulator) -> Metrics:
         rng = points_rng(self.seed)
         tau, x = self._interior(solution, rng)
         along, largest = self._hjb(solution, tau, x)
@@ -66,11 +73,11 @@ class Residuals:
             "hjb_loss": along,
             "hjb_sup_loss": largest,
             "boundary_loss": self._boundary(solution, rng),
-            "td_loss": self._td(solution, rng),
+            "td_loss": self._td(solution, simulator, rng),
         }
         slope = solution.gradient(tau, x) * solution.problem.states.center_and_half_width(x)[1]
         squares = {name: residual.square().mean().item() for name, residual in losses.items()}
-        return {**squares, "value_slope": slope.norm(dim=-1).mean().item()}
+        return Metrics({**squares, "value_slope": slope.norm(dim=-1).mean().item()})
 
     def _interior(self, solution: Solution, rng: torch.Generator) -> tuple[Tensor, Tensor]:
         collocation = Collocation(solution.problem, self.points, sampler="sobol", tau_power=1.0)
@@ -99,13 +106,12 @@ class Residuals:
         tau, x, value = like(solution, points["tau"].squeeze(-1), points["state"], points["value"])
         return solution.raw_value(tau, x) - value
 
-    def _td(self, solution: Solution, rng: torch.Generator) -> Tensor:
-        problem, simulator = solution.problem, self.simulator(solution.problem)
+    def _td(self, solution: Solution, simulator: Simulator, rng: torch.Generator) -> Tensor:
+        problem = solution.problem
         max_steps = round(problem.horizon / simulator.dt)
         steps, x = UniformStates().sample(problem, self.points, max_steps, rng, solution.dtype)
         tau, tau_next, x = like(solution, steps * simulator.dt, (steps - 1) * simulator.dt, x)
-        noise = rng_like(solution, self.seed)
-        step = simulator.step(x, solution.policy(tau, x), noise)
+        step = simulator.step(x, solution.policy(tau, x), noise_rng(solution, self.seed))
         ended = step.reached | step.failed | (steps == 1).to(solution.device)
         target = torch.where(ended, exit_value(problem, step), solution.raw_value(tau_next, step.state))
         return solution.raw_value(tau, x) - target

@@ -3,26 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
-from typing import Literal
 
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from pirl_rl.errors import ArgumentError
-from pirl_rl.evaluation.evidence import Measurement, like, rng_like
+from pirl_rl.evaluation.inputs import like, noise_rng
 from pirl_rl.evaluation.monte_carlo import mean_payoff
-from pirl_rl.figures.evidence import draw_slice
+from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sets import Plane
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
-
-MEANINGS = {
-    "slice_<plane>_mae": "mean |masked V - Monte Carlo of the learned policy| on the plane's 31 x 31 grid, edges "
-    "included, at tau = T, fine simulator; V is known inside A and B",
-    "slice_<plane>_success": "mean of that Monte Carlo",
-}
 
 
 @dataclass(frozen=True)
@@ -54,6 +45,11 @@ class Slice:
     monte_carlo: Tensor
     field: Tensor
 
+    @property
+    def mae(self) -> float:
+        """The mean of |V - Monte Carlo|."""
+        return (self.section.value - self.monte_carlo).abs().mean().item()
+
 
 @dataclass(frozen=True)
 class SlicesEvidence:
@@ -61,49 +57,46 @@ class SlicesEvidence:
 
     slices: dict[str, Slice]
 
-    def numbers(self) -> dict[str, float]:
-        numbers: dict[str, float] = {}
+    def metrics(self) -> dict[str, float]:
+        metrics: dict[str, float] = {}
         for name, cut in self.slices.items():
-            numbers[f"slice_{name}_mae"] = (cut.section.value - cut.monte_carlo).abs().mean().item()
-            numbers[f"slice_{name}_success"] = cut.monte_carlo.mean().item()
-        return numbers
-
-    def figures(self) -> dict[str, Figure]:
-        return {f"slice_{name}": draw_slice(cut) for name, cut in self.slices.items()}
+            metrics[f"slice_{name}_mae"] = cut.mae
+            metrics[f"slice_{name}_success"] = cut.monte_carlo.mean().item()
+        return metrics
 
 
-class Slices(Measurement):
-    """V against noise-free rollouts on a grid of each of the problem's planes.
+class Slices:
+    """V against rollouts on a grid of each of the problem's planes; a problem without planes has no metrics.
 
     Args:
         points: of the grid along each axis.
         rollouts: paths from each point.
-        dt: control step, s.
-        substeps: integration steps in it.
-        crossing: how exits are watched.
         seed: of the noise.
     """
 
-    def __init__(
-        self,
-        points: int = 31,
-        rollouts: int = 64,
-        dt: float = 0.1,
-        substeps: int = 10,
-        crossing: Literal["bridge", "endpoint"] = "endpoint",
-        seed: int = 0,
-    ):
+    def __init__(self, points: int = 31, rollouts: int = 64, seed: int = 0):
         if points < 2 or rollouts < 1:
             raise ArgumentError(f"Slices: expected points >= 2 and rollouts >= 1, got {points} and {rollouts}")
         self.points, self.rollouts, self.seed = points, rollouts, seed
-        self.simulator = partial(Simulator, dt=dt, substeps=substeps, crossing=crossing)
 
-    def measure(self, solution: Solution) -> SlicesEvidence:
-        return SlicesEvidence({name: self._slice(solution, plane) for name, plane in solution.problem.planes.items()})
+    def meanings(self, problem: ReachAvoidProblem) -> dict[str, str]:
+        meanings: dict[str, str] = {}
+        for name in problem.planes:
+            meanings[f"slice_{name}_mae"] = (
+                f"The mean of |V - Monte Carlo|, the latter the mean payoff of {self.rollouts:,} rollouts of the "
+                f"learned policy, on the {self.points} x {self.points} grid of the plane {name}, edges included, at "
+                "tau = T; V is 1 in A and 0 in B."
+            )
+            meanings[f"slice_{name}_success"] = f"The mean of the Monte Carlo in slice_{name}_mae."
+        return meanings
 
-    def _slice(self, solution: Solution, plane: Plane) -> Slice:
+    def __call__(self, solution: Solution, simulator: Simulator) -> SlicesEvidence:
+        planes = solution.problem.planes
+        return SlicesEvidence({name: self._slice(solution, simulator, plane) for name, plane in planes.items()})
+
+    def _slice(self, solution: Solution, simulator: Simulator, plane: Plane) -> Slice:
         section = Section.of(solution, plane, self.points)
-        simulator, noise = self.simulator(solution.problem), rng_like(solution, self.seed)
+        noise = noise_rng(solution, self.seed)
         mean = mean_payoff(simulator, solution.policy, section.tau, section.x, self.rollouts, noise)
         shape = (self.points, self.points)
         return Slice(section, mean.cpu().reshape(shape), projected_field(solution, section).cpu().reshape(*shape, 2))

@@ -1,16 +1,16 @@
-"""How often the learned policy succeeds from the initial law of the episodes."""
+"""The probability that the learned policy succeeds from the initial law of the episodes."""
 
 from __future__ import annotations
 
 import copy
-from functools import partial
-from typing import Literal
+import dataclasses
 
 import torch
 from torch import Tensor
 
 from pirl_rl.errors import ArgumentError
-from pirl_rl.evaluation.evidence import points_rng
+from pirl_rl.evaluation.evaluator import Metrics
+from pirl_rl.evaluation.inputs import points_rng
 from pirl_rl.evaluation.monte_carlo import Policy, mean_payoff, wilson_interval
 from pirl_rl.payoffs import Indicator
 from pirl_rl.problem import ReachAvoidProblem
@@ -20,57 +20,67 @@ from pirl_rl.solution import Solution
 
 
 class Success:
-    """Noise-free episodes of whole steps, as the environment plays them; the same starts and seed at every call.
+    """Episodes of whole steps, as the environment plays them, without exploration noise; the same starts and noise at
+    every call.
 
     Args:
-        episodes: how many.
-        dt: control step, s.
-        substeps: integration steps in it.
-        crossing: how exits are watched.
+        episodes: their number.
         initial_states: the law of x and of the steps to go; default uniform, steps to go random.
         seed: of starts and noise.
     """
 
-    def __init__(
-        self,
-        episodes: int = 10_000,
-        dt: float = 0.1,
-        substeps: int = 1,
-        crossing: Literal["bridge", "endpoint"] = "bridge",
-        initial_states: InitialStates | None = None,
-        seed: int = 0,
-    ):
+    def __init__(self, episodes: int = 10_000, initial_states: InitialStates | None = None, seed: int = 0):
         if episodes < 1:
             raise ArgumentError(f"Success: expected episodes >= 1, got {episodes}")
         self.episodes, self.seed, self.initial_states = episodes, seed, initial_states or UniformStates()
-        self.simulator = partial(Simulator, dt=dt, substeps=substeps, crossing=crossing)
 
-    def __call__(self, solution: Solution) -> dict[str, float]:
-        """success_rate with its 95% interval (success_low, success_high), reward, value_spread, and if known
-        optimal_reward."""
+    def meanings(self, problem: ReachAvoidProblem) -> dict[str, str]:
+        goal = "stay out of B" if problem.objective == "invariance" else "reach A before B"
+        meanings = {
+            "success_rate": f"The share of {self.episodes:,} episodes without exploration noise that {goal}, from "
+            f"starts drawn by {type(self.initial_states).__name__}; the hard sets count, whatever the payoff is.",
+            "success_low": "The lower end of the 95% Wilson interval of success_rate.",
+            "success_high": "The upper end of the 95% Wilson interval of success_rate.",
+            "reward": "The mean payoff of the same episodes, equal to success_rate for the hard payoff.",
+            "value_spread": "The standard deviation of the networks' own V, clamped to [0, 1], over the starts of the "
+            "same episodes: 0 where V is a constant.",
+        }
+        if _optimum_is_known(problem, *_one_point(problem)):
+            meanings["optimal_reward"] = "The reward of the optimal control from the same starts, with the same seed."
+        return meanings
+
+    def __call__(self, solution: Solution, simulator: Simulator) -> Metrics:
         problem, rng = solution.problem, points_rng(self.seed)
-        dt = self.simulator(problem).dt
-        max_steps = round(problem.horizon / dt)
+        max_steps = round(problem.horizon / simulator.dt)
         steps, x = self.initial_states.sample(problem, self.episodes, max_steps, rng, solution.dtype)
-        tau, x = (steps * dt).to(solution.device, solution.dtype), x.to(solution.device)
-        reward = rate = self._mean(problem, solution.policy, tau, x)
+        tau, x = (steps * simulator.dt).to(solution.device, solution.dtype), x.to(solution.device)
+        reward = rate = self._mean(simulator, solution.policy, tau, x)
         if problem.payoff.epsilon > 0:
             hard = copy.copy(problem)
             hard.payoff = Indicator()
-            rate = self._mean(hard, solution.policy, tau, x)
+            rate = self._mean(dataclasses.replace(simulator, problem=hard), solution.policy, tau, x)
         low, high = wilson_interval(rate * self.episodes, self.episodes)
-        spread = solution.raw_value(tau, x).clamp(0, 1).std(correction=0).item()
         metrics = {
             "success_rate": rate,
             "success_low": low,
             "success_high": high,
             "reward": reward,
-            "value_spread": spread,
+            "value_spread": solution.raw_value(tau, x).clamp(0, 1).std(correction=0).item(),
         }
-        if problem.optimal_control(tau[:1], x[:1]) is not None:
-            metrics["optimal_reward"] = self._mean(problem, problem.optimal_control, tau, x)  # type: ignore[arg-type]
-        return metrics
+        if _optimum_is_known(problem, tau[:1], x[:1]):
+            metrics["optimal_reward"] = self._mean(simulator, problem.optimal_control, tau, x)  # type: ignore[arg-type]
+        return Metrics(metrics)
 
-    def _mean(self, problem: ReachAvoidProblem, policy: Policy, tau: Tensor, x: Tensor) -> float:
+    def _mean(self, simulator: Simulator, policy: Policy, tau: Tensor, x: Tensor) -> float:
         rng = torch.Generator(x.device).manual_seed(self.seed)
-        return mean_payoff(self.simulator(problem), policy, tau, x, 1, rng).mean().item()
+        return mean_payoff(simulator, policy, tau, x, 1, rng).mean().item()
+
+
+def _optimum_is_known(problem: ReachAvoidProblem, tau: Tensor, x: Tensor) -> bool:
+    return problem.optimal_control(tau, x) is not None
+
+
+def _one_point(problem: ReachAvoidProblem) -> tuple[Tensor, Tensor]:
+    """The whole horizon (1,) and the center (1, n) of the box of states."""
+    tau = torch.full((1,), problem.horizon)
+    return tau, problem.states.center_and_half_width(tau)[0].unsqueeze(0)

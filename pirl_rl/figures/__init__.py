@@ -1,1 +1,20 @@
-"""All drawing. Figures are made without pyplot, so that no display and no global state is needed."""
+"""All drawing: evidence, runs, comparisons of runs, sweeps and the outer loop's tree; data in, figures out."""
+
+from pirl_rl.figures.accuracy import draw_accuracy
+from pirl_rl.figures.evidence import draw, draw_all
+from pirl_rl.figures.files import DPI, FIGURES, save_figures
+from pirl_rl.figures.rollouts import draw_rollouts
+from pirl_rl.figures.run import draw_run
+from pirl_rl.figures.slices import draw_slices
+
+__all__ = [
+    "DPI",
+    "FIGURES",
+    "draw",
+    "draw_accuracy",
+    "draw_all",
+    "draw_rollouts",
+    "draw_run",
+    "draw_slices",
+    "save_figures",
+]

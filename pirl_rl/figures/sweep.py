@@ -9,14 +9,7 @@ import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-DECADE = 10.0
-"""Positive numbers whose largest and smallest are this far apart are shown on a logarithmic scale."""
-
-
-def spans_decades(values: Sequence[float] | np.ndarray) -> bool:
-    known = np.asarray(values, dtype=float)
-    known = known[np.isfinite(known)]
-    return len(known) > 0 and bool(known.min() > 0) and bool(known.max() >= DECADE * known.min())
+from pirl_rl.figures.scales import spans_decades
 
 
 def draw_grid(metric: str, axes: Mapping[str, Sequence[str]], values: np.ndarray, texts: np.ndarray) -> Figure:

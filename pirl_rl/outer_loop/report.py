@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from pirl_rl.figures.run import save_figures
+from pirl_rl.figures.files import save_figures
+from pirl_rl.figures.tree import draw_tree
 from pirl_rl.files import replacing
 from pirl_rl.outer_loop.history import History, Result
-from pirl_rl.outer_loop.tree import best_path, draw_tree, node, nodes, status, weights
+from pirl_rl.outer_loop.tree import best_path, drawable, node_name, results, status, weights
 
 
 def line(result: Result, history: History) -> str:
@@ -40,7 +41,7 @@ def markdown(history: History) -> str:
     names = ("reward", "success_rate", "calibration_mae", "hjb_loss", "td_loss")
     header = ["candidate", "from", "status", "TD, HJB, BC", "jitter", "replay share", "updates", *names]
     best, rows = str(history.best.checkpoint), []
-    for name, result in nodes(history).items():
+    for name, result in results(history).items():
         origin = "" if result.candidate is None else result.candidate.start_checkpoint
         cells = [f"**{name}**" if name == best else name, origin, status(result, history), weights(result)]
         cells += [_number(value) for value in (result.collocation_jitter, result.collocation_replay_share)]
@@ -55,8 +56,9 @@ def markdown(history: History) -> str:
         lines += [f"## Round {one.number}, {one.advisor}", "", f"> {_plain(one.note)}", ""]
         if one.fallback:
             lines += [f"The advisor that was asked gave no plan: {_plain(one.fallback)}", ""]
-        told = [f"- {node(result, one.number)}: {_plain(result.reason)}" for result in one.results if result.reason]
-        lines += [*told, ""] if told else []
+        unsound = [result for result in one.results if result.reason]
+        lines += [f"- {node_name(result, one.number)}: {_plain(result.reason)}" for result in unsound]
+        lines += [""] if unsound else []
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -64,7 +66,7 @@ def write_report(history: History, out: Path) -> list[Path]:
     """Write `report.md` and `tree.png`; returns their paths."""
     with replacing(out / "report.md") as file:
         file.write(markdown(history))
-    return [out / "report.md", *save_figures({"tree": draw_tree(history)}, out)]
+    return [out / "report.md", *save_figures({"tree": draw_tree(*drawable(history))}, out)]
 
 
 def _number(value: float | None) -> str:

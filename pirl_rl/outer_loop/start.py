@@ -13,7 +13,7 @@ from pirl_rl import checkpoint
 from pirl_rl.assembly import make_trainer
 from pirl_rl.configuration import load_config
 from pirl_rl.errors import ConfigError
-from pirl_rl.evaluation import evaluate
+from pirl_rl.evaluation import evaluate, metrics_of
 from pirl_rl.outer_loop.candidates import JUDGED
 from pirl_rl.outer_loop.history import Result
 from pirl_rl.outer_loop.plan import START
@@ -32,7 +32,8 @@ def measure(trainer: Trainer, path: Path, trust: Sequence[str] = ()) -> Result:
     Raises:
         ConfigError: the run's configuration cannot be built, or it has no finite reward and calibration.
     """
-    metrics = {name: value for name, value in evaluate(trainer.solution, trainer.final).items() if math.isfinite(value)}
+    measured = metrics_of(evaluate(trainer.solution, trainer.simulator, trainer.final))
+    metrics = {name: value for name, value in measured.items() if math.isfinite(value)}
     if missing := [name for name in JUDGED if name not in metrics]:
         raise ConfigError(f"start: expected finite {', '.join(missing)} of {path}, and there is none to compare with")
     try:

@@ -19,9 +19,9 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from pirl_rl.errors import RunError
-from pirl_rl.runs.compare import number, read_run
+from pirl_rl.figures.files import save_figures
 from pirl_rl.figures.sweep import draw_grid, draw_line
-from pirl_rl.figures.run import save_figures
+from pirl_rl.runs.compare import number, read_run
 
 OVERRIDES = Path(".hydra") / "overrides.yaml"
 AVERAGED = "seed"
@@ -135,7 +135,7 @@ def _order(value: str) -> tuple[bool, float, str]:
         return True, 0.0, value
 
 
-def table(sweep: Sweep) -> str:
+def sweep_table(sweep: Sweep) -> str:
     """A Markdown table: a row for each value of the first setting, a column for each of the second."""
     rows, columns = next(iter(sweep.axes)), dict(list(sweep.axes.items())[1:])
     [(second, values)] = columns.items() or [("", [])]
@@ -147,7 +147,7 @@ def table(sweep: Sweep) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
 
 
-def draw(sweep: Sweep) -> Figure:
+def draw_sweep(sweep: Sweep) -> Figure:
     """A heat map of two settings, a line over one."""
     if len(sweep.axes) == 1:
         [(name, values)] = sweep.axes.items()
@@ -173,8 +173,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.error(str(error))
     out = options.out or options.folder
     out.mkdir(parents=True, exist_ok=True)
-    text = table(sweep)
+    text = sweep_table(sweep)
     (out / "sweep.md").write_text(text)
-    [figure] = save_figures({"sweep": draw(sweep)}, out)
+    [figure] = save_figures({"sweep": draw_sweep(sweep)}, out)
     print(text)
     print(f"Written: {out / 'sweep.md'}, {figure}")

@@ -1,0 +1,52 @@
+"""How closed-loop paths are drawn."""
+
+from __future__ import annotations
+
+from matplotlib.artist import Artist
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from pirl_rl.evaluation.rollouts import RolloutsEvidence
+from pirl_rl.figures.evidence import draw
+from pirl_rl.figures.planes import draw_plane
+
+BEYOND = "0.5"
+"""Where paths leave the box of a plane."""
+ENDS = {"reached": ("o", "limegreen"), "failed": ("X", "red"), "out of time": ("s", "white")}
+STARTS = ("white", "gold", "deepskyblue")
+
+
+@draw.register
+def draw_rollouts(evidence: RolloutsEvidence) -> dict[str, Figure]:
+    """Paths projected into every plane over the contours of V at the whole horizon, starts and ends marked."""
+    sections, paths, values = evidence.sections, evidence.paths, evidence.values
+    if paths is None:
+        return {}
+    figure = Figure(figsize=(0.8 + 4.8 * len(sections), 4.8), layout="constrained")
+    ended = zip(paths.reached.tolist(), paths.failed.tolist(), strict=True)
+    ends = ["reached" if reached else "failed" if failed else "out of time" for reached, failed in ended]
+    each = len(ends) // len(values)
+    all_axes = figure.subplots(1, len(sections), squeeze=False)[0]
+    for axes, section in zip(all_axes, sections, strict=True):
+        mesh = draw_plane(axes, section, section.value)
+        axes.set_facecolor(BEYOND)
+        projected = section.plane.project(paths.state).numpy()
+        for i, end in enumerate(ends):
+            line = projected[: paths.steps[i] + 1, i]
+            axes.plot(*line.T, color=STARTS[i // each], lw=0.8)
+            axes.plot(*line[0], "D", color=STARTS[i // each], mec="black", mew=0.6, ms=6, zorder=3)
+            axes.plot(*line[-1], ENDS[end][0], color=ENDS[end][1], mec="black", mew=0.6, ms=6, zorder=3)
+        axes.autoscale()
+    figure.colorbar(mesh, ax=list(all_axes), label=f"learned V, τ = {sections[0].tau[0]:g} s")
+    starts = zip(STARTS, values, strict=True)
+    handles: list[Artist] = [
+        Line2D([], [], color=c, marker="D", mec="black", label=f"from V = {value:.2f}") for c, value in starts
+    ]
+    handles += [
+        Line2D([], [], ls="", marker=marker, color=color, mec="black", label=f"{end}: {ends.count(end)}")
+        for end, (marker, color) in ENDS.items()
+    ]
+    handles.append(Patch(color=BEYOND, label="beyond the plane"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize="small", facecolor="0.7")
+    return {"rollouts": figure}

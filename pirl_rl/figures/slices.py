@@ -1,0 +1,49 @@
+"""How slices are drawn: V, Monte Carlo and the closed loop's directions on a plane."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from pirl_rl.evaluation.slices import Section, Slice, SlicesEvidence
+from pirl_rl.figures.evidence import draw
+from pirl_rl.figures.planes import draw_plane
+
+ARROWS = 11
+"""Of the vector field, along each axis at most."""
+
+
+@draw.register
+def draw_slices(evidence: SlicesEvidence) -> dict[str, Figure]:
+    """A figure for each plane."""
+    return {f"slice_{name}": draw_slice(cut) for name, cut in evidence.slices.items()}
+
+
+def draw_slice(cut: Slice) -> Figure:
+    """Learned V with the closed loop's directions, beside Monte Carlo."""
+    section = cut.section
+    titles = (f"Learned V, τ = {section.tau[0]:g} s", f"Monte Carlo of the policy, mean |difference| {cut.mae:.3f}")
+    figure = Figure(figsize=(10.4, 4.4), layout="constrained")
+    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
+    for axes, title, values in zip((left, right), titles, (section.value, cut.monte_carlo), strict=True):
+        mesh = draw_plane(axes, section, values)
+        axes.set_title(title)
+    _draw_field(left, section, cut.field.numpy())
+    figure.colorbar(mesh, ax=(left, right), label="probability")
+    return figure
+
+
+def _draw_field(axes: Axes, section: Section, field: np.ndarray) -> None:
+    """Directions on paper: arrows of one length, in axes scaled by the box."""
+    half = (np.array(section.plane.box.high) - np.array(section.plane.box.low)) / 2
+    length = np.linalg.norm(field / half, axis=-1, keepdims=True)
+    arrows = field / np.where(length > 0, length, 1)
+    first, second = (axis.numpy() for axis in section.axes)
+    some = slice(None, None, -(-len(first) // ARROWS))
+    shown = arrows[some, some]
+    style: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 0.6 * ARROWS, "pivot": "mid"}
+    style |= {"width": 0.006, "color": "white", "edgecolor": "black", "linewidth": 0.6}
+    axes.quiver(first[some], second[some], shown[..., 0], shown[..., 1], **style)
