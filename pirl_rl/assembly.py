@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -14,11 +14,11 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from pirl_rl import checkpoint
 from pirl_rl.configuration import build, convert
-from pirl_rl.curriculum import Curriculum, Stage
+from pirl_rl.curriculum import Stage
 from pirl_rl.envs import ReachAvoidEnv
 from pirl_rl.errors import CheckpointError, ConfigError
 from pirl_rl.evaluation import Evaluator
-from pirl_rl.losses import PIRLLoss
+from pirl_rl.networks import Actor, Critic
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
 from pirl_rl.trainer import Trainer
@@ -37,30 +37,18 @@ def pick_device(name: str) -> torch.device:
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
-def make_loss(config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[str] = ()) -> PIRLLoss:
-    """Fresh networks in their loss."""
-    # First the device, then the loss: it shares their parameters, but a later move would leave it buffers of its own.
+def make_networks(
+    config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[str] = ()
+) -> tuple[Actor, list[Critic]]:
+    """Fresh networks on the configuration's device: the actor and the critics."""
     device = pick_device(config.device)
     actor = build(config.actor, "actor", trust, problem=problem).to(device)
     count = convert(config.critics, Literal[1, 2], "critics")
-    critics = [build(config.critic, "critic", trust, problem=problem).to(device) for _ in range(count)]
-    with warnings.catch_warnings():
-        # The learner's SoftUpdate comes later, or never where nothing is trained.
-        warnings.filterwarnings("ignore", message="No target network updater")
-        loss = build(
-            config.loss,
-            "loss",
-            trust,
-            problem=problem,
-            actor=actor,
-            critics=critics,
-            simulator=_simulator(config, problem),
-        )
-    return loss.to(device)
+    return actor, [build(config.critic, "critic", trust, problem=problem).to(device) for _ in range(count)]
 
 
-def _simulator(config: DictConfig, problem: ReachAvoidProblem) -> Simulator:
-    """What the environment plays."""
+def make_simulator(config: DictConfig, problem: ReachAvoidProblem) -> Simulator:
+    """The simulator that the environment plays."""
     steps = {name: config.env[name] for name in ("dt", "substeps", "crossing") if name in config.env}
     return Simulator(problem, **steps)
 
@@ -75,29 +63,30 @@ def make_trainer(config: DictConfig, folder: Path | None = None, trust: Sequence
     seed = convert(config.seed, int, "seed")
     if seed < 0:
         raise ConfigError(f"seed: expected an integer >= 0, got {seed}")
-    # Streams of their own: noise of the physics, of the policy, sampling and collocation are not to repeat each other.
+    # Independent streams: the noise of the physics, the policy, sampling and collocation must not repeat each other.
     networks, physics, sampling, points = (int(word) for word in np.random.SeedSequence(seed).generate_state(4))
     torch.manual_seed(networks)
     env: ReachAvoidEnv = build(config.env, "env", trust, seed=physics, device=device)
-    problem = env.problem
-    loss = make_loss(config, problem, trust)
-    actor = loss.actor_network.module
-    schedule, stages = build(config.schedule, "schedule", trust), None
-    if config.stages:
-        stages = [_make_stage(node, f"stages[{i}]", trust, problem) for i, node in enumerate(config.stages)]
-        schedule = stages = Curriculum(schedule, convert(config.trainer.updates, int, "trainer.updates"), stages)
+    parts = {"problem": env.problem, "simulator": env.simulator}
+    actor, critics = make_networks(config, env.problem, trust)
+    with warnings.catch_warnings():
+        # The learner makes the updater of the target networks after the loss.
+        warnings.filterwarnings("ignore", message="No target network updater")
+        # The networks are on their device already: moving the loss alone would leave it buffers of its own.
+        loss = build(config.loss, "loss", trust, parts, problem=env.problem, actor=actor, critics=critics).to(device)
     return build(
         config.trainer,
         "trainer",
         trust,
-        learner=build(config.learner, "learner", trust, loss=loss, schedule=schedule),
-        collector=build(config.collector, "collector", trust, env=env, actor=actor, seed=sampling),
-        collocation=build(config.collocation, "collocation", trust, problem=problem),
-        boundary=build(config.boundary, "boundary", trust, problem=problem),
+        learner=build(config.learner, "learner", trust, loss=loss),
+        collector=build(config.collector, "collector", trust, env=env, actor=loss.actor_network.module, seed=sampling),
+        collocation=build(config.collocation, "collocation", trust, parts),
+        boundary=build(config.boundary, "boundary", trust, parts),
+        schedule=build(config.schedule, "schedule", trust),
+        stages=[_make_stage(node, f"stages[{i}]", trust, parts) for i, node in enumerate(config.stages)],
         during=make_evaluators(config.evaluation, "during", trust),
         final=make_evaluators(config.evaluation, "final", trust),
-        simulator=make_simulator(config.evaluation, problem),
-        stages=stages,
+        simulator=make_evaluation_simulator(config, env.problem),
         logger=build(config.logger, "logger", trust),
         folder=folder,
         config=OmegaConf.to_container(config, resolve=True),
@@ -105,20 +94,14 @@ def make_trainer(config: DictConfig, folder: Path | None = None, trust: Sequence
     )
 
 
-def _make_stage(node: DictConfig, key: str, trust: Sequence[str], problem: ReachAvoidProblem) -> Stage:
-    parts = {str(name): node[name] for name in node}
-    for name, extra in (("schedule", {}), ("initial_states", {}), ("collocation", {"problem": problem})):
-        if node.get(name) is not None:
-            parts[name] = build(node[name], f"{key}.{name}", trust, **extra)
-    try:
-        return Stage(**parts)
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"{key}: {error}") from None
+def _make_stage(node: DictConfig, key: str, trust: Sequence[str], parts: Mapping[str, Any]) -> Stage:
+    stage = OmegaConf.create({"_target_": f"{Stage.__module__}.{Stage.__qualname__}", **node})
+    return build(stage, key, trust, parts)
 
 
-def make_simulator(config: DictConfig, problem: ReachAvoidProblem) -> Simulator:
-    """The simulator of the evaluators, from the node `evaluation`."""
-    return build(config.simulator, "evaluation.simulator", problem=problem)
+def make_evaluation_simulator(config: DictConfig, problem: ReachAvoidProblem) -> Simulator:
+    """The simulator that plays the paths of the evaluators."""
+    return build(config.evaluation.simulator, "evaluation.simulator", problem=problem)
 
 
 def make_evaluators(config: DictConfig, when: str, trust: Sequence[str]) -> dict[str, Evaluator]:
@@ -168,7 +151,7 @@ def begin(trainer: Trainer, start: str) -> Path:
         else:
             trainer.learner.loss.load_state_dict(checkpoint.loss_state(state))
         collapsed = (state.get("rollback") or {}).get("collapsed_at") is not None
-        trainer.collector.begin(state["collector"]["buffer"] if "collector" in state and not collapsed else None)
+        trainer.collector.warm_start(state["collector"]["buffer"] if "collector" in state and not collapsed else None)
     trainer.learner.check_parameters(0)
     return path.absolute()
 

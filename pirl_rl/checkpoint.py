@@ -56,6 +56,17 @@ def loss_state(state: dict[str, Any]) -> dict[str, Any]:
     return {f"{TARGET}{name}": entry for name, entry in own.items()} | loss
 
 
+def network_states(state: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The entries of the actor and of the stacked critics in a checkpoint, named as in their modules."""
+    loss = state.get("learner", state)["loss"]
+    prefixes = ("actor_network_params.module.", "qvalue_network_params.module.")
+    actor, critics = (
+        {name.removeprefix(prefix): entry for name, entry in loss.items() if name.startswith(prefix)}
+        for prefix in prefixes
+    )
+    return actor, critics
+
+
 def restore_rng(rng: torch.Generator, state: torch.Tensor) -> None:
     """Put a random generator back where it was.
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pydantic
+import pydantic_core
 import yaml
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -34,23 +35,25 @@ REFERENCE = re.compile(r"\$\{[\w.]+\}")
 CHECKED = (bool, int, float, str, type(None))
 
 
-def build(node: Any, key: str, trust: Sequence[str] = (), **extra: Any) -> Any:
+def build(node: Any, key: str, trust: Sequence[str] = (), parts: Mapping[str, Any] | None = None, **extra: Any) -> Any:
     """Build the object that a node describes, nested nodes first.
 
     Args:
         node: an OmegaConf mapping with `_target_`.
         key: the node's place in the configuration, for messages.
         trust: modules outside the package that may be named.
-        extra: constructor arguments that no configuration can hold.
+        parts: objects that this and all nested constructors get where they require an argument of that name.
+        extra: constructor arguments of this object that no configuration can hold.
 
     Raises:
         ConfigError: an unknown or forbidden target, an unknown key, a wrong type, or a constructor's refusal.
     """
     if not isinstance(node, DictConfig) or "_target_" not in node:
         raise ConfigError(f"{key}: expected settings with a _target_, got {node!r}")
-    values = {str(name): _value(node, name, f"{key}.{name}", trust) for name in node}
+    parts = parts or {}
+    values = {str(name): _value(node, name, f"{key}.{name}", trust, parts) for name in node}
     constructor = resolve(str(values.pop("_target_")), f"{key}._target_", trust)
-    values = _checked(constructor, values, key, extra)
+    values = _checked(constructor, values, key, extra, parts)
     try:
         return constructor(**values, **extra)
     except (ValueError, TypeError, AttributeError, NotImplementedError) as error:
@@ -58,17 +61,17 @@ def build(node: Any, key: str, trust: Sequence[str] = (), **extra: Any) -> Any:
         raise ConfigError(message if message.startswith(f"{key}.") else f"{key}: {message}") from error
 
 
-def _value(node: DictConfig | ListConfig, name: Any, key: str, trust: Sequence[str]) -> Any:
+def _value(node: DictConfig | ListConfig, name: Any, key: str, trust: Sequence[str], parts: Mapping[str, Any]) -> Any:
     """An entry of a node: nodes with `_target_` built, lists and plain mappings as Python's."""
     if OmegaConf.is_missing(node, name):
         raise ConfigError(f"{key}: a value is missing, give {key}=...")
     value = node[name]
     if isinstance(value, ListConfig):
-        return [_value(value, index, f"{key}[{index}]", trust) for index in range(len(value))]
+        return [_value(value, index, f"{key}[{index}]", trust, parts) for index in range(len(value))]
     if isinstance(value, DictConfig):
         if "_target_" in value:
-            return build(value, key, trust)
-        return {inner: _value(value, inner, f"{key}.{inner}", trust) for inner in value}
+            return build(value, key, trust, parts)
+        return {inner: _value(value, inner, f"{key}.{inner}", trust, parts) for inner in value}
     return value
 
 
@@ -98,9 +101,11 @@ def _within(name: str, modules: Sequence[str]) -> bool:
     return any(name == module or name.startswith(f"{module}.") for module in modules)
 
 
-def _checked(constructor: Any, values: dict[str, Any], key: str, extra: Mapping[str, Any]) -> dict[str, Any]:
-    """The values with their types converted, or a ConfigError that names the key."""
-    parameters = inspect.signature(constructor).parameters
+def _checked(
+    constructor: Any, values: dict[str, Any], key: str, extra: Mapping[str, Any], parts: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The values with their types converted and with the parts they lack, or a ConfigError that names the key."""
+    parameters = parameters_of(constructor)
     open_ended = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
     hints = _hints(constructor)
     checked = {}
@@ -114,9 +119,20 @@ def _checked(constructor: Any, values: dict[str, Any], key: str, extra: Mapping[
             parameter.POSITIONAL_OR_KEYWORD,
             parameter.KEYWORD_ONLY,
         )
-        if required and name not in values and name not in extra:
+        if not required or name in values or name in extra:
+            continue
+        if name not in parts:
             raise ConfigError(f"{key}.{name}: a value is missing, {constructor.__qualname__} needs it")
+        checked[name] = parts[name]
     return checked
+
+
+def parameters_of(constructor: Any) -> Mapping[str, inspect.Parameter]:
+    """The parameters of a class's own constructor, which a metaclass as TorchRL's may hide, or of a function."""
+    if not inspect.isclass(constructor) or constructor.__init__ is object.__init__:
+        return inspect.signature(constructor).parameters
+    _, *parameters = inspect.signature(constructor.__init__).parameters.items()
+    return dict(parameters)
 
 
 def _hints(constructor: Any) -> dict[str, Any]:
@@ -134,8 +150,8 @@ def convert(value: Any, expected: Any, key: str) -> Any:
         return value
     try:
         return pydantic.TypeAdapter(expected, config={"arbitrary_types_allowed": True}).validate_python(value)
-    except pydantic.PydanticSchemaGenerationError:
-        return value
+    except (pydantic.PydanticSchemaGenerationError, pydantic_core.SchemaError):
+        return value  # a type that pydantic knows no check for, as a protocol
     except pydantic.ValidationError as error:
         name = getattr(expected, "__name__", None) if inspect.isclass(expected) else str(expected)
         reason = error.errors()[0]["msg"]

@@ -1,4 +1,4 @@
-"""A curriculum: stages of training, each with its own starts of episodes, loss schedule and collocation."""
+"""A curriculum: stages of training, each with its own starts of episodes, loss weights, collocation and actor rule."""
 
 from __future__ import annotations
 
@@ -16,14 +16,13 @@ from pirl_rl.schedules import Schedule, Weights
 
 
 @dataclass(frozen=True, eq=False)
-class Settings:
+class StageSettings:
     """What a stage may set beside the loss weights; see `Stage`."""
 
     initial_states: InitialStates
     collocation: Collocation
     n_steps: int
     actor_every: int
-    model_steps: int
     actor_rule: ActorRule
     exploration_noise: float
     learning_rate: float
@@ -35,35 +34,37 @@ class Stage:
     """One stage; what is None stays as the run has it.
 
     Attributes:
-        updates: its length, in the unit of all stages: a run of another length stretches them all.
-        schedule: loss weights by the stage's own updates, from 0.
-        initial_states: law of the starts.
+        share: its length relative to the other stages; together they fill the run.
+        schedule: loss weights over the stage, whose updates it counts from 0.
+        initial_states: law of the starts of episodes.
         collocation: sampler of the interior points.
-        n_steps: length of returns.
+        n_steps: length of returns, in control steps.
         actor_every: critic updates for each update of the actor and the targets.
-        model_steps: control steps that the actor's rule "model" looks ahead.
-        actor_rule: of the actor.
-        exploration_noise: deviation of the noise on played actions; where it changes, the replay buffer starts anew.
+        actor_rule: what the actor ascends.
+        exploration_noise: standard deviation of the noise on played actions; where it changes, the replay buffer is
+            emptied, since its actions are those of another policy.
         learning_rate: a rate of its own, which decays over the stage as the run's does over the run.
-        train_actor: False freezes the actor, so that the critics come to rest at the value of one policy.
+        train_actor: False keeps the actor as it is, so that the critics learn the value of one fixed policy.
+
+    Raises:
+        ArgumentError: a number out of range.
     """
 
-    updates: float
+    share: float = 1.0
     schedule: Schedule | None = None
     initial_states: InitialStates | None = None
     collocation: Collocation | None = None
     n_steps: int | None = None
     actor_every: int | None = None
-    model_steps: int | None = None
     actor_rule: ActorRule | None = None
     exploration_noise: float | None = None
     learning_rate: float | None = None
     train_actor: bool = True
 
     def __post_init__(self):
-        if not self.updates > 0:
-            raise ArgumentError(f"stage.updates: expected a number > 0, got {self.updates}")
-        for name in ("n_steps", "actor_every", "model_steps"):
+        if not self.share > 0:
+            raise ArgumentError(f"stage.share: expected a number > 0, got {self.share}")
+        for name in ("n_steps", "actor_every"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ArgumentError(f"stage.{name}: expected at least 1, got {value}")
@@ -72,56 +73,72 @@ class Stage:
         if self.learning_rate is not None and not self.learning_rate > 0:
             raise ArgumentError(f"stage.learning_rate: expected a number > 0, got {self.learning_rate}")
 
-    def over(self, run: Settings) -> Settings:
+    def over(self, run: StageSettings) -> StageSettings:
         """This stage's settings, the run's where it has none."""
-        own = {field.name: getattr(self, field.name) for field in fields(Settings)}
+        own = {field.name: getattr(self, field.name) for field in fields(StageSettings)}
         return replace(run, **{name: value for name, value in own.items() if value is not None})
 
 
 class Curriculum:
-    """Stages one after another, stretched to the length of the run; a `Schedule` itself.
+    """Stages one after another over the updates of a run.
 
     Args:
-        schedule: of the stages that have none, by the run's updates.
+        schedule: loss weights over the run, for stages without a schedule of their own.
         updates: length of the run.
         stages: at least one.
+
+    Raises:
+        ArgumentError: no stage.
     """
 
-    def __init__(self, schedule: Schedule, updates: int, stages: Sequence[Stage] = (Stage(1.0),)):
+    def __init__(self, schedule: Schedule, updates: int, stages: Sequence[Stage] = (Stage(),)):
         if not stages:
             raise ArgumentError("curriculum.stages: expected at least one stage, got none")
-        self.schedule, self.stages, self._updates = schedule, tuple(stages), updates
-        self._before = [0.0, *accumulate(stage.updates for stage in stages)]
-        self._stretch = updates / self._before.pop()
-        # Rounding of the stretch is not to shift a stage by one update.
-        self._starts = [math.ceil(before * self._stretch - 1e-6) for before in self._before]
+        self.schedule, self.stages, self.updates = schedule, tuple(stages), updates
+        before = [0.0, *accumulate(stage.share for stage in stages)]
+        stretch = updates / before.pop()
+        # Rounding of the stretch must not shift a stage by one update.
+        self._firsts = [math.ceil(share * stretch - 1e-6) for share in before]
 
     def index(self, update: int) -> int:
-        """The stage of an update; the last one goes on for ever."""
-        return bisect_right(self._starts, update) - 1
+        """Which stage an update belongs to; the last stage has no end."""
+        return bisect_right(self._firsts, update) - 1
 
-    def begins(self, update: int) -> bool:
-        """Whether a stage begins with this update."""
-        return update in self._starts
+    def is_first(self, update: int) -> bool:
+        """Whether an update is the first of its stage."""
+        return update in self._firsts
 
-    def course(self, update: int) -> float:
-        """How far the learning rate's course is: a fraction of the run, or of a stage with a rate of its own."""
-        index = self.index(update)
-        if self.stages[index].learning_rate is None:
-            return update / self._updates
-        begin, end = [*self._starts, self._updates][index : index + 2]
-        return (update - begin) / (end - begin)
+    def stage(self, update: int) -> Stage:
+        """The stage of an update."""
+        return self.stages[self.index(update)]
 
-    def __call__(self, update: int) -> Weights:
-        schedule, own = self._schedule(update)
-        return schedule(own)
+    def weights(self, update: int) -> Weights:
+        """(w_TD, w_HJB, w_BC) in force at an update."""
+        schedule, count, length = self._schedule(update)
+        return schedule(count, length)
 
     def progress(self, update: int) -> float:
-        schedule, own = self._schedule(update)
-        return schedule.progress(own)
+        """How far the schedule in force has come at an update, in [0, 1]."""
+        schedule, count, length = self._schedule(update)
+        return schedule.progress(count, length)
 
-    def _schedule(self, update: int) -> tuple[Schedule, float]:
-        """The schedule of an update's stage, and the update in that schedule's own count."""
+    def decay(self, update: int) -> float:
+        """How far the learning rate's decay has come: a fraction of the run, or of a stage with a rate of its own."""
+        if self.stage(update).learning_rate is None:
+            return update / self.updates
+        first, end = self._bounds(update)
+        return (update - first) / (end - first)
+
+    def _bounds(self, update: int) -> tuple[int, int]:
+        """First update of an update's stage, and the first one after the stage."""
         index = self.index(update)
-        schedule = self.stages[index].schedule
-        return (self.schedule, update) if schedule is None else (schedule, update / self._stretch - self._before[index])
+        first, end = [*self._firsts, self.updates][index : index + 2]
+        return first, end
+
+    def _schedule(self, update: int) -> tuple[Schedule, int, int]:
+        """The schedule in force, the update in its count, and its length."""
+        own = self.stage(update).schedule
+        if own is None:
+            return self.schedule, update, self.updates
+        first, end = self._bounds(update)
+        return own, update - first, end - first

@@ -49,7 +49,7 @@ class ReachAvoidEnv(EnvBase):
         substeps: int = 1,
         crossing: str = "bridge",
         initial_states: InitialStates | None = None,
-        num_envs: int = 64,
+        num_envs: int = 256,
         seed: int | None = None,
         device: torch.device | str = "cpu",
     ):

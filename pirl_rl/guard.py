@@ -11,7 +11,6 @@ from pirl_rl.errors import CollapseError
 from pirl_rl.evaluation import Success
 from pirl_rl.learner import Learner
 from pirl_rl.simulator import Simulator
-from pirl_rl.solution import Solution
 
 RATES = ("success_rate", "reward")
 SPREAD = "value_spread"
@@ -100,7 +99,7 @@ class Rollback:
         """
         metrics = row
         if not metrics or "success_rate" not in metrics:
-            metrics = self.success(Solution(self.learner.loss), self.simulator).metrics()
+            metrics = self.success(self.learner.loss.solution(), self.simulator).metrics()
         if self.guard.judge(metrics):
             # With the optimisers: those of a collapse would spoil what starts from here.
             self.good, self.good_at = copy.deepcopy(self.learner.state_dict()), update

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torch._dynamo.exc import BackendCompilerFailed
 from torchrl.objectives import SoftUpdate
 
-from pirl_rl.curriculum import Settings
+from pirl_rl.curriculum import StageSettings
 from pirl_rl.errors import ArgumentError, DivergenceError
+from pirl_rl.internals import BackendCompilerFailed
 from pirl_rl.losses import PIRLLoss
-from pirl_rl.schedules import Schedule
+from pirl_rl.schedules import WEIGHTS, Weights
 
 EXPLOSION = 1e6
 """A critic loss above this is a divergence: probabilities err by at most 1, and residuals of interest are far below."""
+
+LossFunction = Callable[[TensorDictBase], tuple[Tensor, dict[str, Tensor]]]
 
 
 class Learner:
@@ -26,19 +29,20 @@ class Learner:
 
     Args:
         loss: critics, actor and their targets.
-        schedule: weights of the critic terms by update.
         learning_rate: Adam's rate at the first update, for critics and actor.
         decay: "cosine" lets the rate fall to zero along a quarter wave, "constant" keeps it.
         actor_every: critic updates for each update of the actor and the targets (d_up).
         polyak: rate of the targets.
         compile: compile the losses; where that fails, as without a C++ compiler, they run eagerly after one warning.
+
+    Raises:
+        ArgumentError: a number out of range, an unknown decay.
     """
 
     def __init__(
         self,
         loss: PIRLLoss,
-        schedule: Schedule,
-        learning_rate: float = 1e-3,
+        learning_rate: float = 3e-3,
         decay: Literal["cosine", "constant"] = "cosine",
         actor_every: int = 2,
         polyak: float = 0.005,
@@ -51,51 +55,64 @@ class Learner:
                 "learner: expected learning_rate > 0, actor_every >= 1 and 0 < polyak <= 1, "
                 f"got {learning_rate}, {actor_every} and {polyak}"
             )
-        self.loss, self.schedule = loss, schedule
+        self.loss = loss
         self.learning_rate, self.decay, self.actor_every = learning_rate, decay, actor_every
         self.targets = SoftUpdate(loss, tau=polyak)
         self.critic_optimizer = _adam(loss.qvalue_network_params, learning_rate)
         self.actor_optimizer = _adam(loss.actor_network_params, learning_rate)
         self.train_actor = True
         self.compile = compile
-        if compile:
-            for name in loss.compilable:
-                setattr(loss, name, torch.compile(getattr(loss, name)))
         self._loss_actor = torch.tensor(math.nan)
+        self._moments_rule = _name(loss.actor_rule)
+        self._compile_critic_loss()
+        self._compile_actor_loss()
 
-    def begin(self, settings: Settings) -> None:
-        """Go on as a stage of a curriculum asks."""
+    def apply(self, settings: StageSettings) -> None:
+        """Continue with the settings of a stage."""
         self.actor_every, self.train_actor = settings.actor_every, settings.train_actor
         self.learning_rate = settings.learning_rate
-        if settings.actor_rule != self.loss.actor_rule:
+        if _name(settings.actor_rule) != self._moments_rule:
             # Adam's moments of one objective are the wrong scale for another's first steps.
             self.actor_optimizer.state.clear()
-        self.loss.actor_rule, self.loss.model_steps = settings.actor_rule, settings.model_steps
-        self.loss.exploration_noise = settings.exploration_noise
+            self._moments_rule = _name(settings.actor_rule)
+        if settings.actor_rule is not self.loss.actor_rule:
+            self.loss.actor_rule = settings.actor_rule
+            self._compile_actor_loss()
 
-    def update(self, batch: TensorDictBase, k: int, progress: float) -> dict[str, Tensor]:
+    def update(self, batch: TensorDictBase, k: int, weights: Weights, decay: float) -> dict[str, Tensor]:
         """The k-th update (from 0) on {"replay", "collocation", "boundary"}; returns the unweighted terms.
 
         "loss_actor" is that of the actor's last update.
 
         Args:
-            progress: how far the learning rate's course is, from 0 to 1.
+            batch: TensorDict on the device of the networks.
+            k: decides whether the actor and the targets are updated too.
+            weights: (w_TD, w_HJB, w_BC) of the critic loss.
+            decay: how far the decay of the learning rate has come, from 0 to 1.
 
         Raises:
             DivergenceError: before the step that would have spoilt the networks.
         """
-        self._set_weights_and_rate(k, progress)
-        loss, terms = self._evaluate("critic_loss", batch)
+        for name, value in zip(WEIGHTS, weights, strict=True):
+            setattr(self.loss, name, value)
+        for optimizer in (self.critic_optimizer, self.actor_optimizer):
+            optimizer.param_groups[0]["lr"] = self.rate(decay)
+        loss, terms = self._evaluated("critic", batch)
         self._check(loss, terms, k + 1)
         self._step(self.critic_optimizer, loss)
         if k % self.actor_every == 0:
             if self.train_actor:
-                loss_actor, _ = self._evaluate("actor_loss", batch)
+                loss_actor, _ = self._evaluated("actor", batch)
                 self._check(loss_actor, {"loss_actor": loss_actor}, k + 1)
                 self._step(self.actor_optimizer, loss_actor)
                 self._loss_actor = loss_actor.detach()
             self.targets.step()
         return {**terms, "loss_actor": self._loss_actor}
+
+    def rate(self, decay: float) -> float:
+        """The learning rate once its decay has come this far, from 0 to 1."""
+        fraction = 1.0 if self.decay == "constant" else (1 + math.cos(math.pi * min(decay, 1.0))) / 2
+        return self.learning_rate * fraction
 
     def check_parameters(self, update: int) -> None:
         """Refuse networks that are spoilt already: a finite loss may have had a gradient that is not.
@@ -107,53 +124,51 @@ class Learner:
             if not parameter.isfinite().all():
                 raise DivergenceError(f"update {update}: {name} is not finite")
 
-    def weights_and_rate(self, k: int, progress: float) -> dict[str, float]:
-        """The loss weights and the learning rate of the k-th update."""
-        td, hjb, boundary = self.schedule(k)
-        fraction = 1.0 if self.decay == "constant" else (1 + math.cos(math.pi * min(progress, 1.0))) / 2
-        return {
-            "td_weight": td,
-            "hjb_weight": hjb,
-            "boundary_weight": boundary,
-            "learning_rate": self.learning_rate * fraction,
-        }
-
     def state_dict(self) -> dict[str, Any]:
         return {
             "loss": self.loss.state_dict(),
             "loss_actor": self._loss_actor,
-            "actor_rule": self.loss.actor_rule,
+            "actor_rule": self._moments_rule,
             "critic_optimizer": self.critic_optimizer.state_dict(),
             "actor_optimizer": self.actor_optimizer.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.loss.load_state_dict(state["loss"])
-        self._loss_actor, self.loss.actor_rule = state["loss_actor"], state["actor_rule"]
+        self._loss_actor, self._moments_rule = state["loss_actor"], state["actor_rule"]
         self.critic_optimizer.load_state_dict(state["critic_optimizer"])
         self.actor_optimizer.load_state_dict(state["actor_optimizer"])
 
-    def _set_weights_and_rate(self, k: int, progress: float) -> None:
-        values = self.weights_and_rate(k, progress)
-        rate = values.pop("learning_rate")
-        for name, value in values.items():
-            setattr(self.loss, name, value)
-        for optimizer in (self.critic_optimizer, self.actor_optimizer):
-            optimizer.param_groups[0]["lr"] = rate
+    # What is compiled is decided in the next two methods and kept in `_critic_loss`, `_actor_loss` and the rule.
 
-    def _evaluate(self, name: str, batch: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """A loss of the module, compiled where that works."""
+    def _compile_critic_loss(self) -> None:
+        self._critic_loss: LossFunction = self._compiler()(self.loss.critic_loss)
+
+    def _compile_actor_loss(self) -> None:
+        compiler, rule = self._compiler(), self.loss.actor_rule
+        rule.compile(compiler)
+        self._actor_loss: LossFunction = compiler(self.loss.actor_loss) if rule.compiles_whole else self.loss.actor_loss
+
+    def _compiler(self) -> Callable[[Any], Any]:
+        return torch.compile if self.compile else lambda function: function
+
+    def _evaluated(self, which: Literal["critic", "actor"], batch: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """A loss, compiled where that works."""
+
+        def evaluate() -> tuple[Tensor, dict[str, Tensor]]:
+            return (self._critic_loss if which == "critic" else self._actor_loss)(batch)
+
         try:
-            return getattr(self.loss, name)(batch)
+            return evaluate()
         except BackendCompilerFailed as error:
             if not self.compile:
                 raise
             self.compile = False
-            for compiled in self.loss.compilable:
-                delattr(self.loss, compiled)
+            self._compile_critic_loss()
+            self._compile_actor_loss()
             reason = str(error).partition("\n")[0]
             warnings.warn(f"updates run eagerly, about half as fast: {reason}", stacklevel=3)
-            return getattr(self.loss, name)(batch)
+            return evaluate()
 
     @staticmethod
     def _step(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
@@ -172,3 +187,8 @@ class Learner:
 
 def _adam(params, rate: float) -> torch.optim.Adam:
     return torch.optim.Adam(list(params.parameters()), rate, fused=True)
+
+
+def _name(rule: object) -> str:
+    """The class of a rule, as a checkpoint keeps it."""
+    return f"{type(rule).__module__}.{type(rule).__qualname__}"

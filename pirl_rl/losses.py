@@ -8,6 +8,7 @@ are buffers: `loss.hjb_weight = 0.3` moves one in place, compiled code included,
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Literal
@@ -16,20 +17,20 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.objectives import TD3Loss
 
-from pirl_rl.actor_rules import ACTOR_RULES, ActorRule, check_rule
+from pirl_rl.actor_rules import ActorRule
 from pirl_rl.errors import ArgumentError
+from pirl_rl.internals import ScheduledTD3Loss
 from pirl_rl.networks import Actor, Critic
-from pirl_rl.operators import advection, generator, masked_mean, require_twice_differentiable
-from pirl_rl.problem import ReachAvoidProblem, has_controlled_noise
-from pirl_rl.simulator import Simulator
+from pirl_rl.operators import generator, masked_mean, require_twice_differentiable
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.schedules import WEIGHTS
+from pirl_rl.solution import Solution
 
 TD_CRITERIA = {"squares": nn.functional.mse_loss, "cross_entropy": nn.functional.binary_cross_entropy}
-WEIGHTS = ("td_weight", "hjb_weight", "boundary_weight")
 
 
-class PIRLLoss(TD3Loss):
+class PIRLLoss(ScheduledTD3Loss):
     """TD3 targets with collocation HJB and boundary terms.
 
     `forward` takes a TensorDict with "replay" (transitions, or states without "next" where no TD term is wanted), and
@@ -41,6 +42,7 @@ class PIRLLoss(TD3Loss):
         problem: the physics.
         actor: pi(tau, x).
         critics: two for TD3; one, with `policy_noise=0`, is DDPG's critic rule.
+        actor_rule: what the actor ascends, see `pirl_rl.actor_rules`; a stage of training may replace it.
         td_criterion: "squares" as in the paper, or "cross_entropy" between target and value, which suits probabilities
             and needs critics in (0, 1).
         target_critics: the target is the "min" of the critics, as in TD3, or their "mean", which is not biased low.
@@ -51,21 +53,15 @@ class PIRLLoss(TD3Loss):
         hjb_delta: HJB residuals beyond it, 1/s, count linearly (Huber), so that corners where V jumps and no network
             can follow do not outweigh the rest; None squares all, as in the paper.
         boundary_delta: the same for the error of V on the boundary.
-        actor_rule: what the actor ascends, "q", "hamiltonian", "both", "model" or "ppo", see `pirl_rl.actor_rules`.
-        model_steps: control steps that "model" looks ahead.
-        simulator: plays them.
-        exploration_noise: deviation of the noise of played actions, in [-1, 1] coordinates; "ppo" needs it above 0.
-        ppo_clip: "ppo" follows the ratio of densities no further than 1 -+ this from the policy that played.
         logit_penalty: factor of the mean square of the actor's outputs before their tanh, added to the actor's loss:
             where tanh saturates, no gradient would bring a wrong action back.
         td_weight, hjb_weight, boundary_weight: initial weights of the three terms.
 
     Raises:
-        ValueError: an unknown actor rule, or one that lacks what it needs.
+        ArgumentError: an argument out of range, or critics with which the actor rule cannot work.
         TypeError: a critic with an activation that is not C^2.
     """
 
-    _schedulable_buffers = frozenset(WEIGHTS)
     td_weight: Tensor
     hjb_weight: Tensor
     boundary_weight: Tensor
@@ -75,35 +71,29 @@ class PIRLLoss(TD3Loss):
         problem: ReachAvoidProblem,
         actor: Actor,
         critics: Sequence[Critic],
+        actor_rule: ActorRule,
         *,
         td_criterion: Literal["squares", "cross_entropy"] = "squares",
         target_critics: Literal["min", "mean"] = "min",
-        policy_noise: float = 0.2,
+        policy_noise: float = 0.0,
         noise_clip: float = 0.5,
         hjb_noise: float = 0.0,
         hjb_noise_clip: float = 1.0,
-        hjb_delta: float | None = None,
+        hjb_delta: float | None = 1.0,
         boundary_delta: float | None = None,
-        actor_rule: ActorRule = "both",
-        model_steps: int = 1,
-        simulator: Simulator | None = None,
-        exploration_noise: float = 0.0,
-        ppo_clip: float = 0.2,
         logit_penalty: float = 0.0,
         td_weight: float = 1.0,
         hjb_weight: float = 0.0,
         boundary_weight: float = 0.0,
     ):
         for critic in critics:
-            check_rule(actor_rule, critic, simulator, exploration_noise)
+            actor_rule.check(critic)
         if td_criterion not in TD_CRITERIA:
             raise ArgumentError(f"loss.td_criterion: expected one of {', '.join(TD_CRITERIA)}, got {td_criterion!r}")
         if td_criterion == "cross_entropy" and not all(isinstance(critic.layers[-1], nn.Sigmoid) for critic in critics):
             raise ArgumentError("loss.td_criterion: 'cross_entropy' needs critics with output 'Sigmoid'")
         if target_critics not in ("min", "mean"):
             raise ArgumentError(f"loss.target_critics: expected 'min' or 'mean', got {target_critics!r}")
-        if model_steps < 1:
-            raise ArgumentError(f"loss.model_steps: expected at least 1, got {model_steps}")
         for critic in critics:
             require_twice_differentiable(critic.layers)
         one = torch.ones(problem.controls.dim)
@@ -129,11 +119,8 @@ class PIRLLoss(TD3Loss):
         self.td_criterion, self.target_critics = td_criterion, target_critics
         self.hjb_noise, self.hjb_noise_clip = hjb_noise, hjb_noise_clip
         self.hjb_delta, self.boundary_delta = hjb_delta, boundary_delta
-        self.actor_rule: ActorRule = actor_rule
-        self.model_steps, self.simulator = model_steps, simulator
-        self.exploration_noise, self.ppo_clip = exploration_noise, ppo_clip
+        self.actor_rule = actor_rule
         self.logit_penalty = logit_penalty
-        self.hamiltonian_operator = generator if has_controlled_noise(problem) else advection
         for name, value in zip(WEIGHTS, (td_weight, hjb_weight, boundary_weight), strict=True):
             self.register_coeff_buffer(name, float(value))
 
@@ -161,15 +148,17 @@ class PIRLLoss(TD3Loss):
             with self._actor() as actor:
                 loss = loss + self.logit_penalty * actor.logits(tau, x).square().mean()
         points = batch["collocation"] if "collocation" in batch.keys() else batch["replay"]
-        return loss - ACTOR_RULES[self.actor_rule](self, batch["replay"], points), {}
+        with self._actor() as actor, self._critics("frozen") as critic:
+            objective = self.actor_rule(Solution(self.problem, actor, critic), batch["replay"], points)
+        return loss - objective, {}
 
     def check_rule(self, rule: ActorRule, exploration_noise: float) -> None:
-        """Refuse a rule of the actor that lacks what it needs.
+        """Refuse an actor rule that cannot work with these critics and this noise on played actions.
 
         Raises:
-            ValueError: naming it.
+            ArgumentError: with what was expected and what was got.
         """
-        check_rule(rule, self.qvalue_network.module, self.simulator, exploration_noise)  # type: ignore[arg-type]
+        rule.check(self.qvalue_network.module, exploration_noise)  # type: ignore[arg-type]
 
     def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """TD3Loss's name for `critic_loss`."""
@@ -180,18 +169,13 @@ class PIRLLoss(TD3Loss):
         loss_qvalue, parts = self.critic_loss(tensordict)
         return TensorDict({"loss_actor": loss_actor, "loss_qvalue": loss_qvalue, **parts})
 
-    @property
-    def compilable(self) -> tuple[str, ...]:
-        """Methods worth compiling. Looking ahead, the actor's loss is a loop over `flow`: compiled as a whole, it would
-        be unrolled into thousands of operations."""
-        return ("critic_loss", "flow" if self.actor_rule == "model" else "actor_loss")
+    def solution(self) -> Solution:
+        """The solution as it stands, on the parameters of this loss: it follows the training."""
+        critics = copy.deepcopy(self.qvalue_network)
+        self.qvalue_network_params.to_module(critics, preserve_module_state=False)
+        return Solution(self.problem, self.actor_network.module, critics.module)  # type: ignore[arg-type]
 
-    def flow(self, x: Tensor, u: Tensor) -> Tensor:
-        """The noise-free control step of the simulator."""
-        assert self.simulator is not None
-        return self.simulator.flow(x, u)
-
-    def act(self, tau: Tensor, state: Tensor, target: bool = False) -> Tensor:
+    def _act(self, tau: Tensor, state: Tensor, target: bool = False) -> Tensor:
         """The (target) actor's output: (N, 1), (N, n) -> (N, m) in [-1, 1]."""
         with self._actor(target) as actor:
             return actor(tau, state)
@@ -203,7 +187,7 @@ class PIRLLoss(TD3Loss):
             yield self.actor_network.module  # type: ignore[misc]
 
     @contextmanager
-    def critics(self, kind: Literal["online", "frozen", "target"] = "online") -> Iterator[Critic]:
+    def _critics(self, kind: Literal["online", "frozen", "target"] = "online") -> Iterator[Critic]:
         """The critic module with the stacked parameters of all critics in place, (critics, N, 1) from one call.
 
         Args:
@@ -216,21 +200,16 @@ class PIRLLoss(TD3Loss):
         with params.to_module(self.qvalue_network, preserve_module_state=False):
             yield self.qvalue_network.module  # type: ignore[misc]
 
-    def residuals(self, tau: Tensor, x: Tensor, action: Tensor, u: Tensor) -> Tensor:
-        """L^u Q_i(., action) (critics, N): tau (N,), x (N, n), the critics' frozen action and the physical u (N, m)."""
-        with self.critics() as critic:
-            return generator(critic.at(action), self.problem, tau, x, u)
-
     def _td_loss(self, replay: TensorDictBase, noise: Tensor) -> Tensor:
         """L_TD summed over critics: (Q_i - r - (1 - d) min_j Q_j^-(y', pi^-(y') + noise))^2."""
         tau, x = replay["next", "tau"], replay["next", "state"]
         with torch.no_grad():
-            action = (self.act(tau, x, target=True) + noise).clamp(-1, 1)
-            with self.critics("target") as critic:
+            action = (self._act(tau, x, target=True) + noise).clamp(-1, 1)
+            with self._critics("target") as critic:
                 values = critic(tau, x, action)
                 value = values.amin(0) if self.target_critics == "min" else values.mean(0)
             target = replay["next", "reward"] + (~replay["next", "terminated"]) * value
-        with self.critics() as critic:
+        with self._critics() as critic:
             value = critic(replay["tau"], replay["state"], replay["action"])
         error = TD_CRITERIA[self.td_criterion](value, target.expand_as(value), reduction="none")
         return error.squeeze(-1).sum(0).mean()
@@ -238,19 +217,20 @@ class PIRLLoss(TD3Loss):
     def _hjb_loss(self, points: TensorDictBase) -> Tensor:
         """L_PDE summed over critics: the mean of (L^u Q_i)^2 over unmasked points, u = pi^-(y) + noise."""
         with torch.no_grad():
-            action = self.act(points["tau"], points["state"], target=True)
+            action = self._act(points["tau"], points["state"], target=True)
             if self.hjb_noise:
                 action = (action + self._clipped_noise(action, self.hjb_noise, self.hjb_noise_clip)).clamp(-1, 1)
             u = self.problem.controls.denormalize(action)
-        residual = self.residuals(points["tau"].squeeze(-1), points["state"], action, u)
+        with self._critics() as critic:
+            residual = generator(critic.at(action), self.problem, points["tau"].squeeze(-1), points["state"], u)
         squares = _huber(residual, self.hjb_delta)
         return masked_mean(squares.sum(0), points["mask"])
 
     def _boundary_loss(self, points: TensorDictBase) -> Tensor:
         """L_BC summed over critics: the mean of (Q_i(y, pi^-(y)) - l_eps)^2."""
         with torch.no_grad():
-            action = self.act(points["tau"], points["state"], target=True)
-        with self.critics() as critic:
+            action = self._act(points["tau"], points["state"], target=True)
+        with self._critics() as critic:
             value = critic(points["tau"], points["state"], action).squeeze(-1)
         return _huber(value - points["value"], self.boundary_delta).sum(0).mean()
 

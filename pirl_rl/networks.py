@@ -6,6 +6,7 @@ losses hold them, one call evaluates all critics, (critics, N, 1).
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Literal
 
@@ -140,7 +141,7 @@ class Critic(nn.Module):
         problem: ReachAvoidProblem,
         hidden: Sequence[int] = (32, 32, 32),
         activation: str = "Tanh",
-        action_input: bool = True,
+        action_input: bool = False,
         root_time: bool = True,
         output: Literal["Sigmoid"] | None = None,
         scaling: Box | None = None,
@@ -160,6 +161,17 @@ class Critic(nn.Module):
     def at(self, action: Tensor) -> CriticValue:
         """V(tau, x) = Q(tau, x, action) with the action (N, m) frozen."""
         return CriticValue(self, action)
+
+
+def stack(critics: Sequence[Critic]) -> Critic:
+    """One critic whose parameters carry a leading axis over `critics`, as TorchRL's losses hold them."""
+    twin = copy.deepcopy(critics[0])
+    for layer, *layers in zip(twin.layers, *(critic.layers for critic in critics), strict=True):
+        for key in layer._parameters:
+            setattr(layer, key, nn.Parameter(torch.stack([getattr(one, key) for one in layers]).detach()))
+        for key in layer._buffers:
+            setattr(layer, key, torch.stack([getattr(one, key) for one in layers]))
+    return twin
 
 
 class CriticValue:

@@ -6,7 +6,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from tensordict import TensorDict
 
 from pirl_rl import checkpoint
 from pirl_rl.collectors import TransitionCollector
-from pirl_rl.curriculum import Curriculum, Settings
+from pirl_rl.curriculum import Curriculum, Stage, StageSettings
 from pirl_rl.errors import ArgumentError, DivergenceError, Interrupted
 from pirl_rl.evaluation import Evaluator, Evidence, Success, evaluate, metrics_of
 from pirl_rl.files import replacing
@@ -25,8 +25,8 @@ from pirl_rl.loggers import MetricsLogger, NoLogger
 from pirl_rl.progress import Progress, interruptible
 from pirl_rl.sampling.boundary import BoundarySampler
 from pirl_rl.sampling.collocation import Collocation
+from pirl_rl.schedules import WEIGHTS, Schedule
 from pirl_rl.simulator import Simulator
-from pirl_rl.solution import Solution
 
 NEGLIGIBLE = 1e-6
 """Weights below this share of their largest of the run, as a sigmoid has far from its center, are taken for zero."""
@@ -39,13 +39,13 @@ class Trainer:
         evidence: of the evaluators of the end, by name; empty before the end of training.
 
     Args:
-        learner: the update.
+        learner: makes the updates.
         collector: fills the replay buffer.
         collocation, boundary: samplers of the physics.
-        stages: changes of starts, collocation, returns and actor over the run; the schedule of `learner` has their
-            weights already; default a single stage.
+        schedule: loss weights over the run.
+        stages: what changes over the run; none is a run of one stage.
         updates: critic updates of the whole run.
-        batch_size: transitions an update.
+        batch_size: transitions of an update.
         log_every: updates between rows of metrics.
         evaluate_every: updates between evaluations during training; 0 for none.
         checkpoint_every: updates between checkpoints; 0 for the last one only.
@@ -64,11 +64,12 @@ class Trainer:
         collector: TransitionCollector,
         collocation: Collocation,
         boundary: BoundarySampler,
-        stages: Curriculum | None = None,
-        updates: int = 20_000,
+        schedule: Schedule,
+        stages: Sequence[Stage] = (),
+        updates: int = 15_000,
         batch_size: int = 256,
         log_every: int = 100,
-        evaluate_every: int = 2_000,
+        evaluate_every: int = 1_500,
         checkpoint_every: int = 5_000,
         rollback: bool = False,
         during: Mapping[str, Evaluator] | None = None,
@@ -89,19 +90,18 @@ class Trainer:
             if not (isinstance(value, int) and value >= least):
                 raise ArgumentError(f"trainer.{name}: expected an integer >= {least}, got {value!r}")
         self.learner, self.collector, self.collocation, self.boundary = learner, collector, collocation, boundary
-        self.stages = stages or Curriculum(learner.schedule, updates)
-        self._unstaged = Settings(
+        self.curriculum = Curriculum(schedule, updates, stages or (Stage(),))
+        self._run_settings = StageSettings(
             initial_states=collector.initial_states,
             collocation=collocation,
             n_steps=collector.n_steps,
             actor_every=learner.actor_every,
-            model_steps=learner.loss.model_steps,
             actor_rule=learner.loss.actor_rule,
             exploration_noise=collector.exploration_noise,
             learning_rate=learner.learning_rate,
         )
-        for stage in self.stages.stages:
-            settings = stage.over(self._unstaged)
+        for stage in self.curriculum.stages:
+            settings = stage.over(self._run_settings)
             learner.loss.check_rule(settings.actor_rule, settings.exploration_noise)
         self.updates, self.batch_size = updates, batch_size
         self.log_every, self.evaluate_every, self.checkpoint_every = log_every, evaluate_every, checkpoint_every
@@ -111,9 +111,9 @@ class Trainer:
         self.folder = None if folder is None else Path(folder)
         self.logger = logger if logger is not None and self.folder is not None else NoLogger()
         self.config = dict(config or {})
-        self.solution = Solution(learner.loss)
+        self.solution = learner.loss.solution()
         self.rng = torch.Generator(self.solution.device).manual_seed(seed)
-        weights = [learner.schedule(k) for k in (*range(0, updates, max(1, updates // 1_000)), updates)]
+        weights = [self.curriculum.weights(k) for k in (*range(0, updates, max(1, updates // 1_000)), updates)]
         self.largest = tuple(max(values) for values in zip(*weights, strict=True))
         self.rollback = self._make_rollback() if rollback else None
         self.update, self.saved, self.wall_seconds = 0, 0, 0.0
@@ -150,7 +150,7 @@ class Trainer:
 
     def _run(self) -> None:
         with interruptible() as interrupted:
-            self._begin_stage()
+            self._enter_stage()
             if self.rollback is not None and self.rollback.good_at is None:
                 self.rollback.judge(self.update)
             self.collector.start()
@@ -172,14 +172,15 @@ class Trainer:
         )
 
     def _loop(self, interrupted: Callable[[], bool]) -> None:
-        begin = time.perf_counter() - self.wall_seconds
+        started = time.perf_counter() - self.wall_seconds
         with Progress(self.updates, self.update) as progress:
             for k in range(self.update, self.updates):
-                if self.stages.begins(k):
-                    self._begin_stage()
+                if self.curriculum.is_first(k):
+                    self._enter_stage()
                 self.collector.step(k)
-                terms = self.learner.update(self.sample(), k, self.stages.course(k))
-                self.update, self.wall_seconds = k + 1, time.perf_counter() - begin
+                weights, decay = self.curriculum.weights(k), self.curriculum.decay(k)
+                terms = self.learner.update(self.sample(), k, weights, decay)
+                self.update, self.wall_seconds = k + 1, time.perf_counter() - started
                 row = self._row(k, terms)
                 if row:
                     self.logger.log(row)
@@ -193,21 +194,21 @@ class Trainer:
                 if stop:
                     raise Interrupted(self.update)
 
-    def _begin_stage(self) -> None:
+    def _enter_stage(self) -> None:
         """Take over what the stage of the next update sets, and the run's own for the rest."""
-        settings = self.stages.stages[self.stages.index(self.update)].over(self._unstaged)
+        settings = self.curriculum.stage(self.update).over(self._run_settings)
         self.collector.play(settings.initial_states, settings.n_steps, settings.exploration_noise)
         self.collocation = settings.collocation
-        self.learner.begin(settings)
+        self.learner.apply(settings)
 
     def sample(self) -> TensorDict:
         """The batch of one update; a term of negligible weight is left out of the work."""
-        weights = self.learner.schedule(self.update)
+        weights = self.curriculum.weights(self.update)
         td, hjb, boundary = (w > NEGLIGIBLE * most for w, most in zip(weights, self.largest, strict=True))
         replay = self.collector.buffer.sample(self.batch_size)
         parts = {"replay": replay if td else replay.exclude("next")}
         if hjb:
-            progress = self.learner.schedule.progress(self.update)
+            progress = self.curriculum.progress(self.update)
             parts["collocation"] = self.collocation.sample(self.rng, replay, progress)
         if boundary:
             parts["boundary"] = self.boundary.sample(self.rng, replay)
@@ -218,8 +219,9 @@ class Trainer:
         evaluates = bool(self.evaluate_every) and (k == 0 or self.update % self.evaluate_every == 0)
         if not (k == 0 or evaluates or self.update % self.log_every == 0):
             return {}
-        stage = {"stage": self.stages.index(k)} if len(self.stages.stages) > 1 else {}
-        row = {"update": self.update, **stage, **self.learner.weights_and_rate(k, self.stages.course(k))}
+        stage = {"stage": self.curriculum.index(k)} if len(self.curriculum.stages) > 1 else {}
+        weights = dict(zip(WEIGHTS, self.curriculum.weights(k), strict=True))
+        row = {"update": self.update, **stage, **weights, "learning_rate": self.learner.rate(self.curriculum.decay(k))}
         for name in ("td_loss", "hjb_loss", "boundary_loss", "loss_actor"):
             value = terms[name].item() if name in terms else math.nan
             row[name if name.startswith("loss") else f"train_{name}"] = value

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import Tensor
 
 import pirl_rl.problems
-from pirl_rl.networks import Critic
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sets import Box
 
@@ -76,17 +74,6 @@ def nested_generator(
     f, sigma = problem.drift(x, u).detach(), problem.diffusion(x, u).detach()
     trace = (sigma @ sigma.mT * torch.stack(rows, -2)).sum((-2, -1))
     return -along_tau + (f * along_x).sum(-1) + trace / 2
-
-
-def stack(critics: Sequence[Critic]) -> Critic:
-    """One critic whose parameters carry a leading axis over `critics`, as TorchRL's losses hold them."""
-    twin = copy.deepcopy(critics[0])
-    for layer, *layers in zip(twin.layers, *(critic.layers for critic in critics), strict=True):
-        for key in layer._parameters:
-            setattr(layer, key, nn.Parameter(torch.stack([getattr(one, key) for one in layers]).detach()))
-        for key in layer._buffers:
-            setattr(layer, key, torch.stack([getattr(one, key) for one in layers]))
-    return twin
 
 
 def points(problem: ReachAvoidProblem, count: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
 
 from pirl_rl.assembly import make_trainer, restore
-from pirl_rl.configuration import CONF, save_config
+from pirl_rl.commands.composition import compose
+from pirl_rl.configuration import save_config
 from pirl_rl.simulator import Simulator
 from pirl_rl.trainer import Trainer
 
@@ -32,8 +32,7 @@ DRIFT = ("+experiment=drift", "+debug=drift", "evaluation.during=[]", "evaluatio
 
 
 def small_config(*overrides: str, base: Sequence[str] = QUICK):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("train", [*base, *overrides])
+    return compose("train", [*base, *overrides])
 
 
 def small_trainer(folder: Path, *overrides: str, base: Sequence[str] = (*QUICK, *EVENTS)) -> Trainer:

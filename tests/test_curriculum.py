@@ -1,4 +1,4 @@
-"""Stages: where they begin, what they stretch, and what the trainer takes over from them."""
+"""Stages: where they start, how they fill a run, and what the trainer takes over from them."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import torch
 from small import assert_same, at_update, interrupt, resumed, small_trainer
 
 from pirl_rl import checkpoint
+from pirl_rl.actor_rules import ClippedSurrogate, Hamiltonian, LookAhead
 from pirl_rl.curriculum import Curriculum, Stage
 from pirl_rl.errors import ConfigError, Interrupted
 from pirl_rl.loggers import read_metrics
@@ -20,32 +21,41 @@ WHOLE = LossSchedule([1, 0, 0], [0, 1, 1], center=50, steepness=0.1)
 def test_without_schedules_of_their_own_stages_leave_the_run_s():
     curriculum = Curriculum(WHOLE, 100, [Stage(1), Stage(3)])
     for k in (0, 24, 25, 99, 100):
-        assert curriculum(k) == WHOLE(k)
-        assert curriculum.progress(k) == WHOLE.progress(k)
+        assert curriculum.weights(k) == WHOLE(k, 100)
+        assert curriculum.progress(k) == WHOLE.progress(k, 100)
 
 
 @pytest.mark.parametrize("updates", [7, 40, 90, 4_000_000])
 def test_stages_stretch_to_the_run(updates):
     """A run of any length sees the same weights at the same fraction of it."""
-    ramp = LinearSchedule([1, 0, 0], [1, 2, 2], start=0, end=3e5)
-    stages = [Stage(1e5, ConstantSchedule([1, 0, 0], [1, 0, 0])), Stage(3e5, ramp)]
+    ramp = LinearSchedule([1, 0, 0], [1, 2, 2], start=0, end=1)
+    stages = [Stage(1, ConstantSchedule([1, 0, 0], [1, 0, 0])), Stage(3, ramp)]
     curriculum = Curriculum(WHOLE, updates, stages)
+    first = math.ceil(updates / 4)
     for k in range(0, updates, max(1, updates // 50)):
-        own = 4e5 * k / updates
-        assert curriculum.index(k) == (own >= 1e5)
-        assert curriculum(k)[1] == pytest.approx(max(0.0, 2 * (own - 1e5) / 3e5), abs=1e-9)
+        assert curriculum.index(k) == (k >= first)
+        assert curriculum.weights(k)[1] == pytest.approx(max(0.0, 2 * (k - first) / (updates - first)), abs=1e-9)
     assert curriculum.index(updates) == 1
 
 
-def test_each_stage_begins_once():
+def test_a_stage_s_schedule_counts_the_stage_s_own_updates():
+    """As the run's schedule counts those of the run: a number above 1 is an update, whatever the other stages are."""
+    own = LossSchedule([1, 0, 0], [0, 1, 1], center=10, steepness=0.3)
+    curriculum = Curriculum(WHOLE, 100, [Stage(1), Stage(3, own)])
+    for k in (25, 30, 35, 99):
+        assert curriculum.weights(k) == own(k - 25, 75)
+        assert curriculum.progress(k) == own.progress(k - 25, 75)
+
+
+def test_each_stage_has_one_first_update():
     curriculum = Curriculum(WHOLE, 30, [Stage(1)] * 3)
-    assert [k for k in range(30) if curriculum.begins(k)] == [0, 10, 20]
+    assert [k for k in range(30) if curriculum.is_first(k)] == [0, 10, 20]
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Stage(0), "stage.updates: expected a number > 0, got 0"),
+        (lambda: Stage(0), "stage.share: expected a number > 0, got 0"),
         (lambda: Stage(1, actor_every=0), "stage.actor_every"),
         (lambda: Stage(1, learning_rate=0.0), "stage.learning_rate: expected a number > 0"),
         (lambda: Curriculum(WHOLE, 10, []), "at least one stage"),
@@ -57,9 +67,10 @@ def test_errors(make, message):
 
 
 STAGES = (
-    "stages=[{updates: 1, "
+    "stages=[{share: 1, "
     "initial_states: {_target_: pirl_rl.sampling.initial_states.UniformStates, low: [0], high: [1]}},"
-    "{updates: 1, actor_every: 5, n_steps: 3, model_steps: 4, "
+    "{share: 1, actor_every: 5, n_steps: 3, "
+    "actor_rule: {_target_: pirl_rl.actor_rules.LookAhead, steps: 4}, "
     "collocation: {_target_: pirl_rl.sampling.collocation.ReplayCollocation, size: 7}}]",
     "trainer.updates=10",
 )
@@ -72,19 +83,20 @@ def test_the_trainer_takes_over_what_a_stage_sets(tmp_path):
 
     def watch(k):
         law = trainer.collector.initial_states.box
-        rates = trainer.collector.n_steps, trainer.learner.actor_every, trainer.learner.loss.model_steps
+        rates = trainer.collector.n_steps, trainer.learner.actor_every, type(trainer.learner.loss.actor_rule)
         seen.append((law and law.low, trainer.collocation.size, *rates))
         step(k)
 
     trainer.collector.step = watch
     trainer.train()
     size = small_trainer(tmp_path / "other", *STAGES).collocation.size
-    assert seen == [((0.0,), size, 1, 2, 1)] * 5 + [(None, 7, 3, 5, 4)] * 5
+    assert seen == [((0.0,), size, 1, 2, Hamiltonian)] * 5 + [(None, 7, 3, 5, LookAhead)] * 5
 
 
 POLICY = (
-    "stages=[{updates: 1, n_steps: 4}, {updates: 2, actor_rule: ppo, exploration_noise: 0.3}, "
-    "{updates: 1, exploration_noise: 0.1}]",
+    "stages=[{share: 1, n_steps: 4}, {share: 2, exploration_noise: 0.3, "
+    "actor_rule: {_target_: pirl_rl.actor_rules.ClippedSurrogate, deviation: 0.3}}, "
+    "{share: 1, exploration_noise: 0.1}]",
     "trainer.updates=12",
 )
 
@@ -111,12 +123,12 @@ def test_a_stage_of_policy_gradients_follows_its_own_noise_alone(collector, tmp_
     def watch():
         loss, replay = trainer.learner.loss, trainer.collector.buffer[:]
         off = (replay["action"] - replay["loc"]).abs()
-        seen.append((loss.actor_rule, loss.exploration_noise, len(replay) >= 128, off.amax().item()))
+        seen.append((type(loss.actor_rule), trainer.collector.exploration_noise, len(replay) >= 128, off.amax().item()))
         return sample()
 
     trainer.sample = watch
     trainer.train()
-    rules = [("hamiltonian", 0.0, True)] * 3 + [("ppo", 0.3, True)] * 6 + [("hamiltonian", 0.1, True)] * 3
+    rules = [(Hamiltonian, 0.0, True)] * 3 + [(ClippedSurrogate, 0.3, True)] * 6 + [(Hamiltonian, 0.1, True)] * 3
     assert [one[:3] for one in seen] == rules
     assert all(off == 0.0 for *_, off in seen[:3])
     assert all(0.5 < off < 2.0 for *_, off in seen[3:9])
@@ -138,19 +150,23 @@ def _steps(optimizer: torch.optim.Optimizer) -> set[float]:
 @pytest.mark.parametrize(
     ("stage", "message"),
     [
-        ("{updates: 1, actor_rule: ppo}", "expected noise > 0 for actor_rule 'ppo', got 0.0"),
-        ("{updates: 1, actor_rule: q}", "critics without the action need"),
-        ("{updates: 1, actor_rule: sac}", "expected one of q, hamiltonian, both, model, ppo, got 'sac'"),
-        ("{updates: 1, exploration_noise: -0.1}", "exploration_noise: expected a number >= 0, got -0.1"),
+        (
+            "{share: 1, actor_rule: {_target_: pirl_rl.actor_rules.ClippedSurrogate, deviation: 0.2}}",
+            r"exploration_noise = 0\.0, got 0\.2",
+        ),
+        ("{share: 1, actor_rule: {_target_: pirl_rl.actor_rules.Q}}", "expected critic.action_input=true, got false"),
+        ("{share: 1, actor_rule: {_target_: pirl_rl.actor_rules.SAC}}", "cannot load pirl_rl.actor_rules.SAC"),
+        ("{share: 1, actor_rule: q}", "stages.1..actor_rule: expected"),
+        ("{share: 1, exploration_noise: -0.1}", "exploration_noise: expected a number >= 0, got -0.1"),
     ],
 )
 def test_a_stage_that_cannot_be_followed_is_refused_at_the_start(stage, message, tmp_path):
     with pytest.raises(ConfigError, match=message):
-        small_trainer(tmp_path, *POLICY, f"stages=[{{updates: 1}}, {stage}]")
+        small_trainer(tmp_path, *POLICY, f"stages=[{{share: 1}}, {stage}]")
 
 
 def test_a_frozen_actor_stays_while_critics_and_targets_move(tmp_path):
-    trainer = small_trainer(tmp_path, "stages=[{updates: 1}, {updates: 1, train_actor: false}]", "trainer.updates=10")
+    trainer = small_trainer(tmp_path, "stages=[{share: 1}, {share: 1, train_actor: false}]", "trainer.updates=10")
     loss, half = trainer.learner.loss, {}
     at_update(trainer, 6, lambda: half.update({name: entry.clone() for name, entry in loss.state_dict().items()}))
     trainer.train()
@@ -162,7 +178,7 @@ def test_a_frozen_actor_stays_while_critics_and_targets_move(tmp_path):
 
 def test_a_stage_with_a_rate_of_its_own_has_the_whole_decay_in_it(tmp_path):
     """From its rate down a quarter wave; the stages beside it stay on the run's course."""
-    stages = "stages=[{updates: 1}, {updates: 2, learning_rate: 0.01}, {updates: 1}]"
+    stages = "stages=[{share: 1}, {share: 2, learning_rate: 0.01}, {share: 1}]"
     trainer = small_trainer(tmp_path, stages, "trainer.updates=40", "trainer.log_every=1", "learner.learning_rate=1e-3")
     trainer.train()
     rate = read_metrics(tmp_path / "metrics.csv")["learning_rate"]

@@ -23,8 +23,7 @@ from pirl_rl.evaluation import (
     metrics_of,
 )
 from pirl_rl.evaluation.reference_states import ReferenceStates
-from pirl_rl.losses import PIRLLoss
-from pirl_rl.networks import Actor, Critic
+from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.operators import generator
 from pirl_rl.payoffs import LipschitzPayoff
 from pirl_rl.problems import Reach1D, Safety1D
@@ -82,7 +81,7 @@ class Known:
 def network(request):
     torch.manual_seed(0)
     problem = request.param()
-    return Solution(PIRLLoss(problem, Actor(problem), [Critic(problem), Critic(problem)]))
+    return Solution(problem, Actor(problem), stack([Critic(problem), Critic(problem)]))
 
 
 def test_exact_error_of_the_exact_value_is_zero():
@@ -150,15 +149,13 @@ def test_residuals_on_reference_states_are_those_of_the_states():
 
 def test_gradient_is_that_of_the_raw_value(network):
     tau, x = torch.rand(50), network.problem.states.sample(50, torch.Generator().manual_seed(0))
-    action = network._action(tau, x)
-    with network.loss.critics() as critic:
-        value = critic.at(action.detach())
+    value = network.critic.at(network._action(tau, x).detach())
 
-        def one(t, y):
-            frozen = network._action(t.reshape(1), y.reshape(1, 1)).detach()
-            return value.critic(t.reshape(1, 1), y.reshape(1, 1), frozen)
+    def one(t, y):
+        frozen = network._action(t.reshape(1), y.reshape(1, 1)).detach()
+        return value.critic(t.reshape(1, 1), y.reshape(1, 1), frozen)
 
-        exact = [torch.func.jacfwd(lambda y, t=t: one(t, y).mean())(y) for t, y in zip(tau, x, strict=True)]
+    exact = [torch.func.jacfwd(lambda y, t=t: one(t, y).mean())(y) for t, y in zip(tau, x, strict=True)]
     torch.testing.assert_close(network.gradient(tau, x), torch.stack(exact).reshape(50, 1), atol=1e-5, rtol=1e-4)
 
 
@@ -252,7 +249,7 @@ def test_every_metric_has_a_meaning_of_its_own_for_every_problem(name):
     """The texts are whole sentences, hold the evaluators' own sizes, and know nothing of any one problem."""
     torch.manual_seed(0)
     problem = getattr(problems, name)()
-    solution = Solution(PIRLLoss(problem, Actor(problem), [Critic(problem)]))
+    solution = Solution(problem, Actor(problem), stack([Critic(problem)]))
     evaluators = {
         "exact": ExactError(7, 9),
         "calibration": Calibration(12, 3),

@@ -13,10 +13,13 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives import TD3Loss
 
-from pirl_rl.losses import WEIGHTS, PIRLLoss
+from pirl_rl.actor_rules import ActorRule, ClippedSurrogate, Hamiltonian, LookAhead, Q, Sum
+from pirl_rl.errors import ArgumentError
+from pirl_rl.losses import PIRLLoss
 from pirl_rl.networks import Actor, Critic
-from pirl_rl.operators import advection
+from pirl_rl.operators import advection, generator
 from pirl_rl.problems import Reach1D, VehicleDrift
+from pirl_rl.schedules import WEIGHTS
 from pirl_rl.simulator import Simulator
 
 RELATIVE = 1e-10
@@ -32,7 +35,7 @@ def float64():
 
 def networks(problem, critics: int = 2):
     torch.manual_seed(3)
-    nets = [Actor(problem, (8, 8), "Tanh"), *(Critic(problem, (9, 7)) for _ in range(critics))]
+    nets = [Actor(problem, (8, 8), "Tanh"), *(Critic(problem, (9, 7), action_input=True) for _ in range(critics))]
     for parameter in nn.ModuleList(nets).parameters():
         nn.init.normal_(parameter, std=0.5)
     return nets[0], nets[1:]
@@ -45,8 +48,10 @@ def target_networks(problem, critics: int = 2):
     return actor, nets
 
 
-def make_loss(problem, critics: int = 2, weights=(1.0, 1.0, 1.0), **kwargs) -> PIRLLoss:
-    loss = PIRLLoss(problem, *networks(problem, critics), **kwargs, **dict(zip(WEIGHTS, weights, strict=True)))
+def make_loss(problem, critics: int = 2, weights=(1.0, 1.0, 1.0), rule: ActorRule | None = None, **kwargs) -> PIRLLoss:
+    """Squared residuals and TD3's smoothing noise where a test says nothing else."""
+    kwargs = {"policy_noise": 0.2, "hjb_delta": None, **kwargs, **dict(zip(WEIGHTS, weights, strict=True))}
+    loss = PIRLLoss(problem, *networks(problem, critics), rule or Sum([Q(), Hamiltonian(problem)]), **kwargs)
     for params in (loss.target_actor_network_params, loss.target_qvalue_network_params):
         for key, entry in params.data.items(True, True):
             _move(key, entry)
@@ -115,7 +120,7 @@ def test_td_alone_is_td3loss_bit_for_bit(problem, critics):
 
 @some_problems
 def test_actor_by_q_is_td3loss_bit_for_bit(problem):
-    loss, batch = make_loss(problem, actor_rule="q"), make_batch(problem)
+    loss, batch = make_loss(problem, rule=Q()), make_batch(problem)
     td3 = td3_twin(loss)
     ours, theirs = loss.actor_loss(batch)[0], td3.actor_loss(batch["replay"])[0]
     assert torch.equal(ours, theirs)
@@ -209,7 +214,7 @@ def assert_same_gradients(ours, loss, by_hand, critics):
 @pytest.mark.parametrize("shift", [0.5, torch.nan])
 def test_masked_points_do_not_count(shift):
     problem = FullNoise(3, 1, 2)
-    loss, batch = make_loss(problem, weights=(0.0, 1.0, 0.0), actor_rule="hamiltonian"), make_batch(problem)
+    loss, batch = make_loss(problem, weights=(0.0, 1.0, 0.0), rule=Hamiltonian(problem)), make_batch(problem)
     other = copy.deepcopy(batch)
     other["collocation", "state"][~batch["collocation", "mask"]] += shift
     assert not torch.equal(other["collocation", "state"], batch["collocation", "state"])
@@ -228,8 +233,10 @@ def test_residuals_beyond_delta_count_linearly():
     batch = make_batch(problem)
     points = batch["collocation"][batch["collocation"]["mask"]]
     loss = make_loss(problem, weights=(0.0, 1.0, 0.0))
-    action = loss.act(points["tau"], points["state"], target=True)
-    size = loss.residuals(points["tau"][:, 0], points["state"], action, problem.controls.denormalize(action)).abs()
+    actor, _ = target_networks(problem)
+    action = actor(points["tau"], points["state"])
+    u = problem.controls.denormalize(action)
+    size = generator(loss.solution().critic.at(action), problem, points["tau"][:, 0], points["state"], u).abs()
     delta = size.median().item()
     expected = torch.where(size <= delta, size**2, 2 * delta * (size - delta / 2)).sum(0).mean()
     bounded = make_loss(problem, weights=(0.0, 1.0, 0.0), hjb_delta=delta)
@@ -273,13 +280,13 @@ def test_a_sigmoid_keeps_probabilities_and_a_linear_output_does_not():
     assert torch.equal(sigmoid(tau[:, None], x, action), torch.sigmoid(value))
 
 
-@pytest.mark.parametrize("rule", ["q", "both"])
+@pytest.mark.parametrize("rule", [Q(), Sum([Hamiltonian(Reach1D()), Q()])], ids=["q", "sum"])
 def test_critics_of_v_refuse_an_actor_that_ascends_q(rule):
     problem = Reach1D()
-    nets = [Critic(problem, (4,)), Critic(problem, (4,), action_input=False)]
-    with pytest.raises(ValueError, match=f"need 'hamiltonian', 'model' or 'ppo', got '{rule}'"):
-        PIRLLoss(problem, Actor(problem), nets, actor_rule=rule)
-    PIRLLoss(problem, Actor(problem), nets[1:], actor_rule="hamiltonian")
+    nets = [Critic(problem, (4,), action_input=action_input) for action_input in (True, False)]
+    with pytest.raises(ValueError, match=r"expected critic\.action_input=true, got false"):
+        PIRLLoss(problem, Actor(problem), nets, rule)
+    PIRLLoss(problem, Actor(problem), nets[1:], Hamiltonian(problem))
 
 
 # The actor's rules
@@ -288,7 +295,7 @@ def test_critics_of_v_refuse_an_actor_that_ascends_q(rule):
 @pytest.mark.usefixtures("float64")
 @pytest.mark.parametrize("problem", PROBLEMS, ids=name)
 def test_hamiltonian_by_hand(problem):
-    loss, batch = make_loss(problem, actor_rule="hamiltonian"), make_batch(problem)
+    loss, batch = make_loss(problem, rule=Hamiltonian(problem)), make_batch(problem)
     kept = batch["collocation"][batch["collocation"]["mask"]]
     actor, critics = networks(problem)
     action = actor(kept["tau"], kept["state"])
@@ -306,12 +313,12 @@ def test_hamiltonian_by_hand(problem):
 
 
 @pytest.mark.usefixtures("float64")
-def test_both_is_the_sum_of_the_rules():
+def test_sum_adds_the_objectives():
     problem = FullNoise(3, 2, 2)
     batch = make_batch(problem)
     q, hamiltonian, both = (
         gradients(loss.actor_loss(batch)[0], loss.actor_network_params)
-        for loss in (make_loss(problem, actor_rule=rule) for rule in ("q", "hamiltonian", "both"))
+        for loss in (make_loss(problem, rule=rule) for rule in (Q(), Hamiltonian(problem), None))
     )
     assert_close(both, [a + b for a, b in zip(q, hamiltonian, strict=True)])
 
@@ -323,7 +330,7 @@ def test_look_ahead_by_hand(problem, steps):
     """Each state alone: Euler steps under the actor until the path meets a set or time is up, then the mean of the
     critics there, 1 in the target."""
     simulator = Simulator(problem, problem.horizon / 10, 4, "endpoint")
-    loss = make_loss(problem, actor_rule="model", model_steps=steps, simulator=simulator)
+    loss = make_loss(problem, rule=LookAhead(steps, simulator))
     batch, dt = make_batch(problem), simulator.dt
     replay = batch["replay"]
     replay["tau"] = dt * torch.arange(len(replay), dtype=torch.float64).remainder(10).unsqueeze(-1)
@@ -352,14 +359,14 @@ def test_look_ahead_by_hand(problem, steps):
 
 
 @pytest.mark.usefixtures("float64")
-def test_ppo_by_hand():
+def test_clipped_surrogate_by_hand():
     """min(rho A, clip(rho) A) row by row with torch's own Gaussian; rows on both sides of both clips."""
     problem = FullNoise(3, 2, 2)
-    loss, batch = ppo_loss(problem), make_batch(problem, 200)
+    loss, batch = surrogate_loss(problem), make_batch(problem, 200)
     replay = batch["replay"]
     following = replay["next"]
     torch.manual_seed(5)
-    replay["loc"] = (loss.act(replay["tau"], replay["state"]) + 0.3 * torch.randn(len(replay), 2)).detach()
+    replay["loc"] = (loss.solution().actor(replay["tau"], replay["state"]) + 0.3 * torch.randn(len(replay), 2)).detach()
     replay["action"] = replay["loc"] + 0.4 * torch.randn(len(replay), 2)
     actor, critics = v_networks(problem)
     value = [sum(net(td["tau"], td["state"], td["state"]) for net in critics) / 2 for td in (replay, following)]
@@ -381,14 +388,14 @@ def test_ppo_by_hand():
 
 
 @pytest.mark.usefixtures("float64")
-def test_ppo_climbs_the_slope_of_the_return():
+def test_clipped_surrogate_climbs_the_slope_of_the_return():
     """Where the played policy is the actor itself, the gradient is that of E[A] in its output: a reward b . a of one
     step gives b divided by A's deviation, |b| sigma. Four standard errors of 200,000 draws are 0.9 %."""
     problem = FullNoise(3, 2, 2)
-    loss, sigma, count = ppo_loss(problem), 0.4, 200_000
+    loss, sigma, count = surrogate_loss(problem), 0.4, 200_000
     torch.manual_seed(6)
     tau, x = torch.full((count, 1), 0.5), problem.states.sample(1).double().expand(count, -1)
-    loc = loss.act(tau, x).detach()
+    loc = loss.solution().actor(tau, x).detach()
     played, slope = loc + sigma * torch.randn(count, 2), torch.tensor([0.6, -0.8])
     ended = torch.ones(count, 1, dtype=torch.bool)
     following = {"tau": tau, "state": x, "reward": (played @ slope).unsqueeze(-1), "terminated": ended}
@@ -401,14 +408,14 @@ def test_ppo_climbs_the_slope_of_the_return():
     assert error <= 0.009 * sum(b.square().sum() for b in by_hand).sqrt()
 
 
-def ppo_loss(problem) -> PIRLLoss:
-    return PIRLLoss(problem, *v_networks(problem), actor_rule="ppo", exploration_noise=0.4, ppo_clip=0.3)
+def surrogate_loss(problem) -> PIRLLoss:
+    return PIRLLoss(problem, *v_networks(problem), ClippedSurrogate(deviation=0.4, clip=0.3))
 
 
-def test_ppo_without_returns_is_refused():
+def test_clipped_surrogate_without_returns_is_refused():
     problem = Reach1D()
     with pytest.raises(ValueError, match="expected a weight of the TD loss above 0"):
-        ppo_loss(problem).actor_loss(TensorDict({"replay": make_batch(problem)["replay"].exclude("next")}))
+        surrogate_loss(problem).actor_loss(TensorDict({"replay": make_batch(problem)["replay"].exclude("next")}))
 
 
 def assert_no_gradient_for_critics(loss, batch):
@@ -427,12 +434,13 @@ def test_look_ahead_follows_the_hamiltonian_as_the_step_shrinks():
     def slope(dt):
         simulator = Simulator(problem, dt, 1, "endpoint")
         # Critics of V: Q's own dependence on it is no part of either.
-        loss = PIRLLoss(problem, *v_networks(problem), actor_rule="model", simulator=simulator)
+        loss = PIRLLoss(problem, *v_networks(problem), LookAhead(1, simulator))
         value = loss.actor_loss(TensorDict({"replay": kept}))[0]
         return torch.cat([entry.flatten() / dt for entry in gradients(value, loss.actor_network_params)])
 
-    loss = PIRLLoss(problem, *v_networks(problem), actor_rule="hamiltonian")
-    loss.hamiltonian_operator = advection
+    first_order = Hamiltonian(problem)
+    first_order.operator = advection
+    loss = PIRLLoss(problem, *v_networks(problem), first_order)
     limit = loss.actor_loss(TensorDict({"replay": kept}))[0]
     exact = torch.cat([entry.flatten() for entry in gradients(limit, loss.actor_network_params)])
     errors = [((slope(dt) - exact).norm() / exact.norm()).item() for dt in (1e-2, 1e-3)]
@@ -448,9 +456,9 @@ def v_networks(problem):
 @pytest.mark.usefixtures("float64")
 @some_problems
 def test_logit_penalty_by_hand(problem):
-    plain, batch = make_loss(problem, actor_rule="q"), make_batch(problem)
-    ours = make_loss(problem, actor_rule="q", logit_penalty=0.3)
-    action = plain.act(batch["replay", "tau"], batch["replay", "state"])
+    plain, batch = make_loss(problem, rule=Q()), make_batch(problem)
+    ours = make_loss(problem, rule=Q(), logit_penalty=0.3)
+    action = plain.solution().actor(batch["replay", "tau"], batch["replay", "state"])
     expected = plain.actor_loss(batch)[0] + 0.3 * action.atanh().square().mean()
     assert_close([ours.actor_loss(batch)[0]], [expected])
 
@@ -459,12 +467,13 @@ def test_logit_penalty_by_hand(problem):
 @some_problems
 def test_cross_entropy_and_mean_target_by_hand(problem):
     torch.manual_seed(3)
-    nets = [Critic(problem, (9, 7), output="Sigmoid") for _ in range(2)]
+    nets = [Critic(problem, (9, 7), action_input=True, output="Sigmoid") for _ in range(2)]
     kwargs = {"policy_noise": 0.0, "td_criterion": "cross_entropy", "target_critics": "mean"}
-    loss, batch = PIRLLoss(problem, Actor(problem, (8,), "Tanh"), nets, **kwargs), make_batch(problem)
+    loss, batch = PIRLLoss(problem, Actor(problem, (8,), "Tanh"), nets, Q(), **kwargs), make_batch(problem)
     replay = batch["replay"]
     following = replay["next"]
-    values = [net(following["tau"], following["state"], loss.act(following["tau"], following["state"])) for net in nets]
+    action = loss.solution().actor(following["tau"], following["state"])
+    values = [net(following["tau"], following["state"], action) for net in nets]
     # Payoffs and their mean stay probabilities: one of the two ends a path.
     following["reward"] = following["reward"] * following["terminated"]
     target = (following["reward"] + ~following["terminated"] * (values[0] + values[1]) / 2).detach()
@@ -481,9 +490,7 @@ def test_cross_entropy_and_mean_target_by_hand(problem):
         ({"td_criterion": "absolute"}, "td_criterion: expected one of squares, cross_entropy, got 'absolute'"),
         ({"td_criterion": "cross_entropy"}, "needs critics with output 'Sigmoid'"),
         ({"target_critics": "max"}, "target_critics: expected 'min' or 'mean', got 'max'"),
-        ({"actor_rule": "model"}, "loss.simulator: expected a simulator"),
-        ({"actor_rule": "ppo"}, "loss.actor_rule: 'ppo' takes advantages over V"),
-        ({"model_steps": 0}, "model_steps: expected at least 1, got 0"),
+        ({"rule": ClippedSurrogate(0.2)}, "actor_rule: ClippedSurrogate takes advantages over V"),
     ],
 )
 def test_wrong_arguments_are_named(kwargs, message):
@@ -491,20 +498,31 @@ def test_wrong_arguments_are_named(kwargs, message):
         make_loss(Reach1D(), **kwargs)
 
 
-def test_ppo_without_noise_is_refused():
-    with pytest.raises(ValueError, match=r"collector.exploration_noise: expected noise > 0 .* got 0\.0"):
-        PIRLLoss(Reach1D(), *v_networks(Reach1D()), actor_rule="ppo")
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ClippedSurrogate(0.0), r"actor_rule.deviation: expected noise > 0 on played actions, got 0\.0"),
+        (lambda: ClippedSurrogate(0.2, clip=0.0), r"actor_rule.clip: expected a number > 0, got 0\.0"),
+        (lambda: LookAhead(0, Simulator(Reach1D())), "actor_rule.steps: expected at least 1, got 0"),
+        (lambda: Sum([]), "actor_rule.rules: expected at least one rule, got none"),
+    ],
+)
+def test_wrong_arguments_of_a_rule_are_named(make, message):
+    with pytest.raises(ArgumentError, match=message):
+        make()
 
 
-def test_an_unknown_rule_is_named():
-    with pytest.raises(ValueError, match="actor_rule: expected one of q, hamiltonian, both, model, ppo, got 'sac'"):
-        make_loss(Reach1D(), actor_rule="sac")
+def test_clipped_surrogate_needs_the_noise_that_is_played():
+    critic = v_networks(Reach1D())[1][0]
+    ClippedSurrogate(0.2).check(critic, exploration_noise=0.2)
+    with pytest.raises(ArgumentError, match=r"exploration_noise = 0\.1, got 0\.2"):
+        ClippedSurrogate(0.2).check(critic, exploration_noise=0.1)
 
 
 def test_a_relu_critic_is_refused_by_name():
     problem = Reach1D()
     with pytest.raises(TypeError, match="got ReLU"):
-        PIRLLoss(problem, Actor(problem), [Critic(problem, (4,), "ReLU")])
+        PIRLLoss(problem, Actor(problem), [Critic(problem, (4,), "ReLU")], Hamiltonian(problem))
 
 
 # Weights

@@ -8,10 +8,10 @@ import math
 import numpy as np
 import pytest
 import torch
-from oracles import PROBLEMS, FullNoise, name, nested_generator, points, stack
+from oracles import PROBLEMS, FullNoise, name, nested_generator, points
 from torch import nn
 
-from pirl_rl.networks import Critic
+from pirl_rl.networks import Critic, stack
 from pirl_rl.operators import ACTIVATIONS, advection, generator, require_twice_differentiable
 from pirl_rl.problems import Reach1D
 
@@ -28,7 +28,7 @@ def _float64():
 def random_critic(problem, activation: str = "Tanh", seed: int = 0, **kwargs) -> Critic:
     """Weights and biases far from zero, so that every derivative of every activation counts."""
     torch.manual_seed(seed)
-    critic = Critic(problem, (9, 7), activation, **{"output": "Sigmoid", **kwargs})
+    critic = Critic(problem, (9, 7), activation, **{"output": "Sigmoid", "action_input": True, **kwargs})
     for parameter in critic.parameters():
         nn.init.normal_(parameter, std=0.7)
     return critic

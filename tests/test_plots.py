@@ -15,8 +15,7 @@ from pirl_rl.figures.one_dimensional import draw_value, solve_on_grid
 from pirl_rl.figures.run import draw_run
 from pirl_rl.figures.training import HELD_OUT, TRAINING, WEIGHTS, draw_training
 from pirl_rl.loggers import read_metrics
-from pirl_rl.losses import PIRLLoss
-from pirl_rl.networks import Actor, Critic
+from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.problems import Reach1D, Safety1D
 from pirl_rl.runs import compare
 from pirl_rl.sets import Box
@@ -34,7 +33,7 @@ class Plane(Reach1D):
 
 def random_solution(problem) -> Solution:
     torch.manual_seed(0)
-    return Solution(PIRLLoss(problem, Actor(problem), [Critic(problem), Critic(problem)]))
+    return Solution(problem, Actor(problem), stack([Critic(problem), Critic(problem)]))
 
 
 def write_metrics(path, scale: float = 1.0) -> None:

@@ -186,7 +186,7 @@ def test_a_path_that_ended_in_a_substep_is_held(crossing):
 def test_one_step_mean_is_the_generator_to_first_order(problem):
     """(E[phi(tau - h, x')] - phi(tau, x))/h -> L phi: the error falls with h, within three standard errors."""
     torch.manual_seed(0)
-    critic = Critic(problem, (9, 7)).double()
+    critic = Critic(problem, (9, 7), action_input=True).double()
     for parameter in critic.parameters():
         torch.nn.init.normal_(parameter, std=0.7)
     tau, x, action, u = (entry.double() for entry in points(problem, 3))  # three points, many paths

@@ -23,7 +23,7 @@ logging.getLogger("torchrl").setLevel(logging.WARNING)
 
 
 class TransitionCollector(Protocol):
-    """What the trainer asks of a collector; a state is loaded, or begun with, before `start`."""
+    """What the trainer asks of a collector. `load_state_dict` and `warm_start` come before `start`."""
 
     buffer: TensorDictReplayBuffer
 
@@ -43,14 +43,17 @@ class TransitionCollector(Protocol):
         ...
 
     def play(self, initial_states: InitialStates, n_steps: int, exploration_noise: float) -> None:
-        """Go on with other starts, returns and noise, as a stage of a curriculum asks.
+        """Continue with other starts, returns and noise, as a stage of a curriculum asks.
 
-        What was played with other noise leaves the buffer: it is another policy's.
+        Where the noise changes, the buffer is emptied: its actions are those of another policy.
         """
 
-    def begin(self, buffer: dict[str, Any] | None) -> None:
-        """Begin a run with a trained actor: with the transitions of another collector's `buffer` state, if any, and a
-        warm-up, if any is still needed, in which the actor plays in place of random actions."""
+    def warm_start(self, buffer: dict[str, Any] | None) -> None:
+        """Prepare a run whose actor is trained already: it plays the warm-up in place of random actions.
+
+        Args:
+            buffer: the "buffer" entry of another collector's state, whose transitions are taken over.
+        """
 
     def start(self) -> None:
         """Fill the buffer to its warm-up."""

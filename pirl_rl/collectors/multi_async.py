@@ -20,6 +20,7 @@ from pirl_rl.collectors.buffers import buffer_state, check_sizes, fill_buffer, l
 from pirl_rl.collectors.transitions import Exploration, Transitions, exploring_policy
 from pirl_rl.envs import ReachAvoidEnv
 from pirl_rl.errors import ArgumentError, CollectorError
+from pirl_rl.internals import lock_writes_with, write_lock
 from pirl_rl.networks import Actor
 from pirl_rl.sampling.initial_states import InitialStates
 
@@ -42,13 +43,13 @@ class MultiAsyncCollector:
         env: ReachAvoidEnv,
         actor: Actor,
         workers: int = 2,
-        frames_per_batch: int = 256,
+        frames_per_batch: int = 5_120,
         updates_per_batch: int = 32,
         warmup_frames: int = 4_096,
         buffer_size: int = 50_000,
-        exploration_noise: float = 0.2,
+        exploration_noise: float = 0.0,
         exploration: Literal["always", "start"] = "always",
-        n_steps: int = 1,
+        n_steps: int = 20,
         seed: int = 0,
         patience: float = 60.0,
     ):
@@ -61,7 +62,7 @@ class MultiAsyncCollector:
         self._env, self._workers, self._random_warmup = env, workers, True
         self._frames_per_batch, self._transitions = frames_per_batch, Transitions(n_steps)
         self._collector: Any = None
-        self._write_lock = self.buffer._write_lock
+        self._write_lock = write_lock(self.buffer)
         storage: Any = self.buffer.storage
         weakref.finalize(self, shutil.rmtree, storage.scratch_dir, ignore_errors=True)
         self._delivered, self._delivered_at = 0, 0.0
@@ -91,7 +92,7 @@ class MultiAsyncCollector:
         if self._collector is not None:
             self.start()
 
-    def begin(self, buffer: dict[str, Any] | None) -> None:
+    def warm_start(self, buffer: dict[str, Any] | None) -> None:
         self._random_warmup = False
         if buffer is not None:
             fill_buffer(self.buffer, self._rng.device, self._env, buffer)
@@ -104,7 +105,7 @@ class MultiAsyncCollector:
         self._policy = exploring_policy(self._copy, self._exploration)
         # A generator's state does not survive the way into a spawned process, nor is a worker to watch itself.
         self.buffer.set_rng(None)
-        self.buffer._write_lock = self._write_lock
+        lock_writes_with(self.buffer, self._write_lock)
         try:
             self._collector = torchrl_collectors.MultiAsyncCollector(
                 [partial(_worker_env, recipe, os.getpid()) for recipe in recipes],
@@ -120,7 +121,7 @@ class MultiAsyncCollector:
         except RuntimeError as error:
             raise CollectorError(f"rollout workers did not start, see their messages above: {error}") from None
         self.buffer.set_rng(self._rng)
-        self.buffer._write_lock = _WatchedLock(self._write_lock, self._check_workers)  # type: ignore[assignment]
+        lock_writes_with(self.buffer, _WatchedLock(self._write_lock, self._check_workers))
         self._collector.set_seed(self._seed)
         self._collector.start()
         self._delivered_at = time.monotonic()

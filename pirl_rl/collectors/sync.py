@@ -11,6 +11,7 @@ from pirl_rl.checkpoint import restore_rng
 from pirl_rl.collectors.buffers import buffer_state, check_sizes, fill_buffer, load_buffer, make_buffer
 from pirl_rl.collectors.transitions import Exploration, Transitions, exploring_policy
 from pirl_rl.envs import ReachAvoidEnv
+from pirl_rl.internals import carried, plays_at_random
 from pirl_rl.networks import Actor
 from pirl_rl.sampling.initial_states import InitialStates
 
@@ -23,7 +24,8 @@ class SyncCollector:
         actor: the learner's own, its parameters followed live.
         frames_per_batch: transitions a batch, a multiple of the environment's batch size.
         updates_per_batch: updates between two batches.
-        warmup_frames: transitions before the first update, of uniformly random actions; of the actor after `begin`.
+        warmup_frames: transitions before the first update, played by uniformly random actions, or after
+            `warm_start` by the actor.
         buffer_size: capacity of the replay buffer.
         exploration_noise: deviation of the noise on actions.
         exploration: when there is noise, "always" or at the "start" of episodes, see `Exploration`.
@@ -35,13 +37,13 @@ class SyncCollector:
         self,
         env: ReachAvoidEnv,
         actor: Actor,
-        frames_per_batch: int = 256,
-        updates_per_batch: int = 8,
+        frames_per_batch: int = 5_120,
+        updates_per_batch: int = 80,
         warmup_frames: int = 4_096,
         buffer_size: int = 50_000,
-        exploration_noise: float = 0.2,
+        exploration_noise: float = 0.0,
         exploration: Literal["always", "start"] = "always",
-        n_steps: int = 1,
+        n_steps: int = 20,
         seed: int = 0,
     ):
         check_sizes(env, frames_per_batch, updates_per_batch, warmup_frames, buffer_size)
@@ -78,7 +80,7 @@ class SyncCollector:
             self._exploration.deviation = exploration_noise
             self.buffer.empty()
 
-    def begin(self, buffer: dict[str, Any] | None) -> None:
+    def warm_start(self, buffer: dict[str, Any] | None) -> None:
         if buffer is not None:
             fill_buffer(self.buffer, self._rng.device, self.env, buffer)
         # TorchRL's collector then takes its random frames for played; the count is part of the state.
@@ -101,7 +103,7 @@ class SyncCollector:
             "buffer": buffer_state(self.buffer, self._rng),
             "exploration_noise": self.exploration_noise,
             "frames": self._collector.state_dict()["frames"],
-            "carrier": self._collector._carrier.to_dict(),
+            "carrier": carried(self._collector).to_dict(),
             "env_rng": self.env.rng.get_state(),
         }
 
@@ -110,7 +112,7 @@ class SyncCollector:
         self._exploration.deviation = state["exploration_noise"]
         # TorchRL saves no environment state; the carried TensorDict is all that a ReachAvoidEnv has.
         self._load_frames(state["frames"])
-        self._collector._carrier.update(TensorDict(state["carrier"], device=self.env.device))
+        carried(self._collector).update(TensorDict(state["carrier"], device=self.env.device))
         restore_rng(self.env.rng, state["env_rng"])
 
     def _load_frames(self, frames: int) -> None:
@@ -118,6 +120,6 @@ class SyncCollector:
 
     def _collect(self) -> None:
         # TorchRL leaves what the policy wrote before beside a warm-up's random actions.
-        random = self._collector._should_use_random_frames()
+        random = plays_at_random(self._collector)
         batch = next(self._batches)
         self.buffer.extend(self._transitions(batch.exclude("loc") if random else batch))

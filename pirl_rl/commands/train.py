@@ -17,7 +17,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from pirl_rl import checkpoint
 from pirl_rl.assembly import begin, make_trainer, restore
+from pirl_rl.commands.composition import register
 from pirl_rl.commands.console import INTERRUPTED, named_modules, override, quiet_libraries, table, told
+from pirl_rl.commands.methods import check_method
 from pirl_rl.configuration import CONF, load_config, save_config
 from pirl_rl.errors import ConfigError
 from pirl_rl.evaluation import meanings_of
@@ -34,6 +36,7 @@ def train(config: DictConfig) -> float:
     folder = Path(hydra_config.runtime.output_dir)
     with told(folder, one_of_many=hydra_config.mode == RunMode.MULTIRUN), _new(folder):
         # What the user types is trusted; what a directory from elsewhere says is not.
+        check_method(config, hydra_config.overrides.task)
         trust = [*config.trust, *named_modules(hydra_config.overrides.task)]
         trainer = make_trainer(config, folder, trust)
         if config.start is not None:
@@ -99,6 +102,7 @@ def main() -> None:
             folder = Path(resumed[-1].partition("=")[2])
             resume(folder, [item for item in arguments if item not in resumed])
         else:
+            register()
             train()
     except KeyboardInterrupt:
         print("stopped at once; what the last checkpoint holds is kept", file=sys.stderr)

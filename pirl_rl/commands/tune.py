@@ -14,13 +14,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import hydra
-from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from pirl_rl.assembly import begin, make_trainer
+from pirl_rl.commands.composition import compose, register
 from pirl_rl.commands.console import INTERRUPTED, named_modules, quiet_libraries, told
 from pirl_rl.configuration import CONF, build, convert
 from pirl_rl.errors import ConfigError
@@ -229,6 +229,7 @@ def main() -> None:
     with told(Path()):
         if {"-m", "--multirun"} & {*arguments}:
             raise ConfigError("-m: a loop runs its candidates itself, expected candidates=... and parallel=... instead")
+    register()
     try:
         tune()
     except KeyboardInterrupt:

@@ -80,7 +80,7 @@ class Residuals:
         return Metrics({**squares, "value_slope": slope.norm(dim=-1).mean().item()})
 
     def _interior(self, solution: Solution, rng: torch.Generator) -> tuple[Tensor, Tensor]:
-        collocation = Collocation(solution.problem, self.points, sampler="sobol")
+        collocation = Collocation(solution.problem, self.points, sampler="sobol", tau_power=1.0)
         if self.states is None:
             points = collocation.sample(rng)
             tau, x, mask = points["tau"], points["state"], points["mask"]
@@ -102,7 +102,7 @@ class Residuals:
 
     def _boundary(self, solution: Solution, rng: torch.Generator) -> Tensor:
         half = self.points // 2
-        points = BoundarySampler(solution.problem, initial=self.points - half, faces=half).sample(rng)
+        points = BoundarySampler(solution.problem, self.points - half, half, tau_power=1.0).sample(rng)
         tau, x, value = like(solution, points["tau"].squeeze(-1), points["state"], points["value"])
         return solution.raw_value(tau, x) - value
 

@@ -57,12 +57,12 @@ def _in_force(path: Path, trainer: Trainer, trust: Sequence[str]) -> dict[str, A
     config = load_config(path.parent.parent)
     config.device, before = "cpu", make_trainer(config, None, trust)
     last = max(_update(checkpoint.load(path)) - 1, 0)
-    settings: dict[str, Any] = {"weights": before.learner.schedule(last)}
+    settings: dict[str, Any] = {"weights": before.curriculum.weights(last)}
     if isinstance(trainer.collocation, ReplayCollocation):
-        own = before.stages.stages[before.stages.index(last)].collocation or before.collocation
+        own = before.curriculum.stage(last).collocation or before.collocation
         ends, progress = trainer.collocation, 0.0
         if isinstance(own, ReplayCollocation):
-            ends, progress = own, before.learner.schedule.progress(last)
+            ends, progress = own, before.curriculum.progress(last)
         for name in ("jitter", "replay_share"):
             first, final = getattr(ends, name)
             settings[f"collocation_{name}"] = first + (final - first) * progress

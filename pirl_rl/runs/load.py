@@ -12,9 +12,10 @@ from torch import Tensor
 
 from pirl_rl.errors import CheckpointError, ConfigError
 from pirl_rl import checkpoint
-from pirl_rl.assembly import fitting, make_loss
+from pirl_rl.assembly import fitting, make_networks
 from pirl_rl.configuration import build, load_config
 from pirl_rl.evaluation.trajectories import Trajectories, closed_loop
+from pirl_rl.networks import stack
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
@@ -87,10 +88,13 @@ def load_run(folder: str | Path, trust: Sequence[str] = (), weights: str | None 
         raise CheckpointError(f"weights: expected the name of a file in {folder / checkpoint.FOLDER}, got {weights}")
     path = checkpoint.newest(folder) if weights is None else folder / checkpoint.FOLDER / weights
     state = checkpoint.load(path)
-    loss = make_loss(config, build(config.env.problem, "env.problem", trust), trust)
+    problem = build(config.env.problem, "env.problem", trust)
+    actor, critics = make_networks(config, problem, trust)
+    critic = stack(critics)
     with fitting(path):
-        loss.load_state_dict(checkpoint.loss_state(state))
-    return Run(Solution(loss), config, int(state["update"]))
+        for network, entries in zip((actor, critic), checkpoint.network_states(state), strict=True):
+            network.load_state_dict(entries)
+    return Run(Solution(problem, actor, critic), config, int(state["update"]))
 
 
 def refuse_links(folder: Path) -> None:

@@ -45,7 +45,7 @@ class BoundarySampler:
         initial: int = 100,
         faces: int = 100,
         widen: float = 1.0,
-        tau_power: float = 1.0,
+        tau_power: float = 2.0,
         replay_share: float = 0.0,
         seed: int = 0,
     ):

@@ -31,10 +31,10 @@ class Collocation:
     def __init__(
         self,
         problem: ReachAvoidProblem,
-        size: int = 1_000,
+        size: int = 300,
         sampler: Literal["uniform", "sobol"] = "uniform",
         widen: float = 1.0,
-        tau_power: float = 1.0,
+        tau_power: float = 2.0,
     ):
         if sampler not in ("uniform", "sobol"):
             raise ArgumentError(f"collocation.sampler: expected 'uniform' or 'sobol', got {sampler!r}")
@@ -89,10 +89,10 @@ class ReplayCollocation(Collocation):
     def __init__(
         self,
         problem: ReachAvoidProblem,
-        size: int = 1_000,
+        size: int = 300,
         sampler: Literal["uniform", "sobol"] = "uniform",
         widen: float = 1.0,
-        tau_power: float = 1.0,
+        tau_power: float = 2.0,
         replay_share: Sequence[float] = (1.0, 1.0),
         jitter: Sequence[float] = (0.0, 0.0),
     ):

@@ -1,0 +1,91 @@
+"""What is compiled, where a stage changes the actor rule and where no compiler is found."""
+
+from __future__ import annotations
+
+import shutil
+import warnings
+from functools import partial
+
+import pytest
+import torch
+from small import command, small_trainer
+from torch._dynamo.utils import counters
+
+from pirl_rl import learner
+from pirl_rl.actor_rules import ClippedSurrogate, LookAhead
+from pirl_rl.simulator import Simulator
+
+RULES = (
+    "stages=[{share: 1, actor_rule: {_target_: pirl_rl.actor_rules.LookAhead, steps: 2}}, "
+    "{share: 1, exploration_noise: 0.2, actor_rule: {_target_: pirl_rl.actor_rules.ClippedSurrogate, deviation: 0.2}}]",
+    "trainer.updates=8",
+    "learner.actor_every=1",
+)
+"""A look ahead, of which the simulator's step alone is compiled, then a surrogate, which is compiled as a whole."""
+
+
+def eager_calls(monkeypatch) -> list[str]:
+    """Names of what should run compiled, one for each time that Python itself runs it."""
+    calls: list[str] = []
+    for owner, name in ((learner.PIRLLoss, "critic_loss"), (ClippedSurrogate, "__call__"), (Simulator, "flow")):
+        inner = getattr(owner, name)
+
+        def watched(self, *arguments, inner=inner, label=f"{owner.__name__}.{name}"):
+            if not torch.compiler.is_compiling():
+                calls.append(label)
+            return inner(self, *arguments)
+
+        monkeypatch.setattr(owner, name, watched)
+    return calls
+
+
+def train_over_rules(tmp_path, *overrides: str):
+    trainer = small_trainer(tmp_path, *RULES, *overrides)
+    rules = []
+    sample = trainer.sample
+    trainer.sample = lambda: rules.append(type(trainer.learner.loss.actor_rule)) or sample()
+    trainer.train()
+    assert rules == [LookAhead] * 4 + [ClippedSurrogate] * 4
+    return trainer
+
+
+def assert_nothing_ran_eagerly(tmp_path, calls: list[str]) -> None:
+    torch._dynamo.reset()
+    counters.clear()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="updates run eagerly")
+        trainer = train_over_rules(tmp_path, "compile=true")
+    assert trainer.learner.compile
+    assert calls == []
+    assert not counters["graph_break"]
+
+
+def test_a_new_rule_is_compiled_too(tmp_path, monkeypatch):
+    """Traced whole by the compiler's front end; what it makes of it is left out here to save a minute."""
+    calls = eager_calls(monkeypatch)
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager", fullgraph=True))
+    assert_nothing_ran_eagerly(tmp_path, calls)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (shutil.which("g++") or shutil.which("clang++")), reason="torch.compile needs a C++ compiler")
+def test_a_new_rule_is_compiled_to_machine_code(tmp_path, monkeypatch):
+    assert_nothing_ran_eagerly(tmp_path, eager_calls(monkeypatch))
+
+
+def test_a_new_rule_runs_eagerly_where_nothing_is_compiled(tmp_path, monkeypatch):
+    calls = eager_calls(monkeypatch)
+    train_over_rules(tmp_path, "compile=false")
+    assert {*calls} == {"PIRLLoss.critic_loss", "ClippedSurrogate.__call__", "Simulator.flow"}
+
+
+def test_a_new_rule_without_a_compiler_on_the_path(tmp_path):
+    """One warning, then both rules run eagerly to the end."""
+    quick = ("+experiment=reach1d", "+debug=default", "evaluation.during=[]", "evaluation.final=[]")
+    cache = tmp_path / "cache"
+    done = command(
+        *quick, *RULES, "compile=true", cwd=tmp_path, PATH="/nowhere", CXX="", TORCHINDUCTOR_CACHE_DIR=str(cache)
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("updates run eagerly") == 1
+    assert "run      " in done.stdout
