@@ -80,7 +80,7 @@ def make_trainer(config: DictConfig, folder: Path | None = None, trust: Sequence
         stages=[_make_stage(node, f"stages[{i}]", trust, parts) for i, node in enumerate(config.stages)],
         during=make_evaluators(config.evaluation, "during", trust),
         final=make_evaluators(config.evaluation, "final", trust),
-        simulator=make_simulator(config.evaluation, env.problem),
+        simulator=make_evaluation_simulator(config, env.problem),
         logger=build(config.logger, "logger", trust),
         folder=folder,
         config=OmegaConf.to_container(config, resolve=True),
@@ -93,9 +93,9 @@ def _make_stage(node: DictConfig, key: str, trust: Sequence[str], parts: Mapping
     return build(stage, key, trust, parts)
 
 
-def make_simulator(config: DictConfig, problem: ReachAvoidProblem) -> Simulator:
-    """The simulator of the evaluators, from the node `evaluation`."""
-    return build(config.simulator, "evaluation.simulator", problem=problem)
+def make_evaluation_simulator(config: DictConfig, problem: ReachAvoidProblem) -> Simulator:
+    """The simulator that plays the paths of the evaluators."""
+    return build(config.evaluation.simulator, "evaluation.simulator", problem=problem)
 
 
 def make_evaluators(config: DictConfig, when: str, trust: Sequence[str]) -> dict[str, Evaluator]:

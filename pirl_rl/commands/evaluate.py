@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from pirl_rl.assembly import make_evaluators, make_simulator
+from pirl_rl.assembly import make_evaluation_simulator, make_evaluators
 from pirl_rl.commands.console import named_modules, override, table, told
 from pirl_rl.configuration import load_config
 from pirl_rl.errors import ConfigError
@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         evaluators = make_evaluators(config.evaluation, "final", trust)
         solution = load_run(folder, trust, device=config.device).solution
         refuse_links(folder)
-        evidence = evaluate(solution, make_simulator(config.evaluation, solution.problem), evaluators)
+        evidence = evaluate(solution, make_evaluation_simulator(config, solution.problem), evaluators)
         metrics = metrics_of(evidence)
         with replacing(folder / RESULTS) as file:
             file.write(json.dumps(metrics, indent=2) + "\n")
