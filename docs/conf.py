@@ -30,27 +30,23 @@ myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 nb_execution_mode = "off"
 
+# A literal block is an equation or a layout unless it names its language.
+highlight_language = "none"
+math_eqref_format = "Eq. ({number})"
+
 # Docstrings are plain text in Google's style; see _extensions/plain_docstrings.py.
 autodoc_preserve_defaults = True
 autodoc_default_options = {"no-value": True}
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 
-html_theme = "pydata_sphinx_theme"
+html_theme = "furo"
 html_title = "pirl_rl"
 html_math_renderer = "mathml"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_show_sourcelink = False
-html_theme_options = {
-    "logo": {"text": "pirl_rl"},
-    "navbar_align": "left",
-    "show_toc_level": 2,
-    "navigation_with_keys": False,
-    "secondary_sidebar_items": ["page-toc"],
-    "footer_start": ["copyright"],
-    "footer_end": [],
-}
+html_show_sphinx = False
 
 reference_rooms = {
     "problems": (
