@@ -27,7 +27,7 @@ lint: $(READY) ## Check style, format and types
 
 docs: $(READY) ## Build the documentation site from nothing; open docs/_build/html/index.html
 	rm -rf docs/_build docs/_generated
-	$(BIN)/sphinx-build -W --keep-going -j auto docs docs/_build/html
+	$(BIN)/sphinx-build -W --keep-going docs docs/_build/html
 
 bench: $(READY) ## Time the learner and the simulator on one thread
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/learner.py

@@ -36,7 +36,7 @@ math_eqref_format = "Eq. ({number})"
 
 # Docstrings are plain text in Google's style; see _extensions/plain_docstrings.py.
 autodoc_preserve_defaults = True
-autodoc_default_options = {"no-value": True}
+autodoc_default_options = {"member-order": "bysource", "special-members": "__call__"}
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 

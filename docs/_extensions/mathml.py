@@ -16,13 +16,14 @@ def inline(translator, node: nodes.math) -> None:
 
 def display(translator, node: nodes.math_block) -> None:
     """Write an equation on lines of its own, with its number and a link to it where it has a label."""
-    translator.body.append(translator.starttag(node, "div", CLASS="math"))
+    equation = convert(node.astext(), display="block")
+    translator.body.append(translator.starttag(node, "div", CLASS="math") + f"<div>{equation}</div>")
     if node["number"]:
         number = get_node_equation_number(translator, node)
         translator.body.append(f'<span class="eqno">({number})')
         translator.add_permalink_ref(node, "Link to this equation")
         translator.body.append("</span>")
-    translator.body.append(convert(node.astext(), display="block") + "</div>\n")
+    translator.body.append("</div>\n")
     raise nodes.SkipNode
 
 

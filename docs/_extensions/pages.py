@@ -22,7 +22,7 @@ TEXTS = {
     "CHANGELOG.md": "changelog.md",
     "models/drift/README.md": "model_drift.md",
 }
-OPTIONS = "   :members:\n   :member-order: bysource\n   :show-inheritance:\n   :special-members: __call__\n"
+OPTIONS = ("members", "ignore-module-all", "show-inheritance")  # what a package gathers is shown where it is written
 LINK = re.compile(r"\]\(((?!\w+:|#)[^)#\s]+)")
 
 
@@ -37,7 +37,8 @@ def write_reference(folder: Path, rooms: dict[str, tuple[str, list[str]]]) -> No
     for page, (title, modules) in rooms.items():
         text = [title, "=" * len(title), ""]
         for module in modules:
-            text += [module, "-" * len(module), "", f".. automodule:: {module}", OPTIONS]
+            options = [f"   :{option}:" for option in OPTIONS]
+            text += [module, "-" * len(module), "", f".. automodule:: {module}", *options, ""]
         (folder / f"{page}.rst").write_text("\n".join(text))
 
 
