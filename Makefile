@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.setup
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test lint bench figures clean
+.PHONY: help setup train test lint docs bench figures clean
 
 help: ## Print this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
@@ -25,15 +25,19 @@ lint: $(READY) ## Check style, format and types
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
 
+docs: $(READY) ## Build the documentation site from nothing; open docs/_build/html/index.html
+	rm -rf docs/_build docs/_generated
+	$(BIN)/sphinx-build -W --keep-going docs docs/_build/html
+
 bench: $(READY) ## Time the learner and the simulator on one thread
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/learner.py
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/simulator.py
 
-figures: $(READY) ## Compare all runs below runs/: a table and a figure in docs/figures
-	$(BIN)/python -m pirl_rl.compare runs --out docs/figures
+figures: $(READY) ## Compare all runs below runs/: a table and a figure in runs/comparison
+	$(BIN)/python -m pirl_rl.compare runs --out runs/comparison
 
 clean: ## Remove .venv, caches and build output; runs stay
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache
+	rm -rf $(VENV) build dist docs/_build docs/_generated *.egg-info .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # pip comes last into a new environment and .setup last of all, so what was interrupted starts again.

@@ -45,7 +45,7 @@ def check_weights(name: str, values: Sequence[float]) -> Weights:
 
 
 class _Transition:
-    """w_i(k) = w_i^init + (w_i^final - w_i^init) eta(k), Eq. (wight_scheduling) of the paper."""
+    """w_i(k) = w_i^init + (w_i^final - w_i^init) eta(k), Eq. (weight_scheduling)."""
 
     def __init__(self, initial: Sequence[float], final: Sequence[float]):
         self.initial, self.final = check_weights("initial", initial), check_weights("final", final)

@@ -1,4 +1,4 @@
-"""The README's own example: its problem trains by its command, and its Python block opens the run."""
+"""The README's own example: its problem trains by its command, and its Python blocks train it and open a run."""
 
 import json
 import os
@@ -16,15 +16,21 @@ from pirl_rl.simulator import Simulator
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
-PROBLEM, USE = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+PROBLEM, TRAIN, OPEN = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 COMMAND = re.search(r"^python (-m pirl_rl\.train \+experiment=own .*)$", README, re.MULTILINE)
 
 
 @pytest.fixture(scope="module")
-def run_folder(tmp_path_factory):
-    """A run of the README's problem from an otherwise empty directory, by its command in debug settings."""
+def home(tmp_path_factory):
+    """A directory with nothing but the README's `my_module.py`."""
     home = tmp_path_factory.mktemp("own")
     (home / "my_module.py").write_text(PROBLEM)
+    return home
+
+
+@pytest.fixture(scope="module")
+def run_folder(home):
+    """A run of the README's problem by its command in debug settings."""
     assert COMMAND
     command = [sys.executable, *shlex.split(COMMAND[1]), "+debug=default", "trainer.updates=30"]
     path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
@@ -47,11 +53,21 @@ def test_the_command_trains(run_folder):
     }
 
 
-def test_the_python_block_opens_the_run(run_folder, monkeypatch):
-    """The third state lies in the drain: V and its Monte Carlo are exactly 0, and its path has failed."""
-    monkeypatch.syspath_prepend(str(run_folder.parent.parent.parent))
-    block, opened = re.subn(r'load_run\("[^"]+"', f"load_run({str(run_folder)!r}", USE)
+def test_the_python_block_opens_the_run(run_folder, home, monkeypatch):
+    monkeypatch.syspath_prepend(str(home))
+    block, opened = re.subn(r'load_run\("[^"]+"', f"load_run({str(run_folder)!r}", f"import pirl_rl\n{OPEN}")
     assert opened == 1
+    names = {}
+    exec(block, names)
+    assert names["run"].update == 30
+
+
+def test_the_python_block_trains(home, tmp_path, monkeypatch):
+    """The third state lies in the drain: V and its Monte Carlo are exactly 0, and its path has failed."""
+    monkeypatch.syspath_prepend(str(home))
+    monkeypatch.chdir(tmp_path)
+    block, shortened = re.subn(r"\(Whirlpool, updates=2000,", "(Whirlpool, updates=30, compile=False,", TRAIN)
+    assert shortened == 1
     names = {}
     exec(block, names)
     value, check, paths = names["value"], names["check"], names["paths"]
@@ -78,10 +94,3 @@ def test_the_readme_problem_obeys_its_sde():
     swirl = torch.tensor([-0.5 * 0.5 - 0.5, 0.5 - 0.5 * 0.5])
     torch.testing.assert_close(step.state.mean(0), x + h * (u + swirl), atol=1e-3, rtol=0)
     torch.testing.assert_close(torch.cov(step.state.T), 0.36 * h * torch.eye(2), atol=8e-5, rtol=0)
-
-
-def test_every_file_the_readme_names_exists():
-    named = re.findall(r"`((?:pirl_rl|conf|benchmarks)/[\w/.]*)`|\]\(([\w/.]+\.(?:md|ipynb|py))\)", README)
-    missing = [path for pair in named for path in pair if path and not (ROOT / path).exists()]
-    assert named
-    assert not missing

@@ -1,0 +1,152 @@
+"""Configuration of the documentation site, which `make docs` builds with Sphinx."""
+
+from __future__ import annotations
+
+import sys
+from importlib.metadata import version as installed_version
+from pathlib import Path
+
+DOCS = Path(__file__).resolve().parent
+sys.path[:0] = [str(DOCS / "_extensions"), str(DOCS.parent)]
+
+project = "pirl_rl"
+author = "The pirl_rl developers"
+project_copyright = "the pirl_rl developers, MIT licence"
+version = release = installed_version("pirl_rl")
+
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx_copybutton",
+    "mathml",
+    "pages",
+    "plain_docstrings",
+]
+exclude_patterns = ["_build"]
+
+# Pages are Markdown; notebooks show the outputs that they are stored with.
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 3
+nb_execution_mode = "off"
+
+# A literal block is an equation or a layout unless it names its language.
+highlight_language = "none"
+math_eqref_format = "Eq. ({number})"
+
+# Docstrings are plain text in Google's style; see _extensions/plain_docstrings.py.
+autodoc_preserve_defaults = True
+autodoc_default_options = {"member-order": "bysource", "special-members": "__call__"}
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+
+html_theme = "furo"
+html_title = "pirl_rl"
+html_math_renderer = "mathml"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_show_sourcelink = False
+html_show_sphinx = False
+
+reference_rooms = {
+    "problems": (
+        "Problems, sets and payoffs",
+        [
+            "pirl_rl.problem",
+            "pirl_rl.sets",
+            "pirl_rl.payoffs",
+            "pirl_rl.problems.reach1d",
+            "pirl_rl.problems.safety1d",
+        ],
+    ),
+    "drift": (
+        "The drifting vehicle",
+        [
+            "pirl_rl.problems.drift.problem",
+            "pirl_rl.problems.drift.three_state",
+            "pirl_rl.problems.drift.vehicle",
+            "pirl_rl.problems.drift.equilibria",
+            "pirl_rl.problems.drift.starts",
+            "pirl_rl.problems.drift.env",
+            "pirl_rl.problems.drift.reference_states",
+        ],
+    ),
+    "numerics": ("Simulator and operators", ["pirl_rl.simulator", "pirl_rl.operators"]),
+    "networks": ("Networks and schedules", ["pirl_rl.networks", "pirl_rl.schedules"]),
+    "sampling": (
+        "States and points",
+        ["pirl_rl.sampling.initial_states", "pirl_rl.sampling.collocation", "pirl_rl.sampling.boundary"],
+    ),
+    "actor_rules": ("Actor rules", ["pirl_rl.actor_rules"]),
+    "training": (
+        "Environment, loss and training",
+        [
+            "pirl_rl.envs",
+            "pirl_rl.losses",
+            "pirl_rl.learner",
+            "pirl_rl.curriculum",
+            "pirl_rl.trainer",
+            "pirl_rl.guard",
+            "pirl_rl.checkpoint",
+            "pirl_rl.loggers",
+        ],
+    ),
+    "collectors": (
+        "Collectors",
+        [
+            "pirl_rl.collectors",
+            "pirl_rl.collectors.sync",
+            "pirl_rl.collectors.multi_async",
+            "pirl_rl.collectors.transitions",
+            "pirl_rl.collectors.buffers",
+        ],
+    ),
+    "evaluation": (
+        "Solutions and evaluation",
+        [
+            "pirl_rl.solution",
+            "pirl_rl.evaluation",
+            "pirl_rl.evaluation.exact_error",
+            "pirl_rl.evaluation.residuals",
+            "pirl_rl.evaluation.success",
+            "pirl_rl.evaluation.calibration",
+            "pirl_rl.evaluation.accuracy",
+            "pirl_rl.evaluation.reference_states",
+            "pirl_rl.evaluation.slices",
+            "pirl_rl.evaluation.rollouts",
+            "pirl_rl.evaluation.trajectories",
+            "pirl_rl.evaluation.monte_carlo",
+        ],
+    ),
+    "figures": ("Figures", ["pirl_rl.figures.run", "pirl_rl.figures.evidence", "pirl_rl.figures.sweep"]),
+    "runs": (
+        "Runs and configuration",
+        [
+            "pirl_rl.runs.load",
+            "pirl_rl.runs.compare",
+            "pirl_rl.runs.sweeps",
+            "pirl_rl.configuration",
+            "pirl_rl.assembly",
+            "pirl_rl.errors",
+        ],
+    ),
+    "outer_loop": (
+        "The outer loop",
+        [
+            "pirl_rl.outer_loop.advisors",
+            "pirl_rl.outer_loop.advisors.greedy",
+            "pirl_rl.outer_loop.advisors.optuna",
+            "pirl_rl.outer_loop.advisors.command",
+            "pirl_rl.outer_loop.advisors.openai",
+            "pirl_rl.outer_loop.advisors.file",
+            "pirl_rl.outer_loop.plan",
+            "pirl_rl.outer_loop.history",
+            "pirl_rl.outer_loop.parsing",
+            "pirl_rl.outer_loop.prompt",
+            "pirl_rl.outer_loop.loop",
+            "pirl_rl.outer_loop.record",
+            "pirl_rl.outer_loop.report",
+        ],
+    ),
+}
+"""Pages of the API reference: the name of each page, its title and the modules on it."""

@@ -1,0 +1,94 @@
+"""README and docs: their length, the files that they name, and the commands that they show."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
+
+from pirl_rl.configuration import CONF
+
+ROOT = Path(__file__).parent.parent
+TEXTS = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "models/drift/README.md")),
+    *sorted((ROOT / "docs").glob("*.md")),
+]
+LINK = re.compile(r"\]\(((?!\w+:|#)[^)#\s]+)")
+NAMED = re.compile(r"`((?:pirl_rl|conf|benchmarks|docs|models|notebooks|tests)/[\w/.]*)`")
+
+
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+
+
+def commands(text: str) -> list[str]:
+    """The lines of a text's shell blocks that train or tune, without comments, continued lines joined."""
+    blocks = "\n".join(re.findall(r"```bash\n(.*?)```", text, re.DOTALL)).replace("\\\n", " ")
+    lines = (line.strip() for line in blocks.splitlines())
+    return [line for line in lines if re.match(r"python -m pirl_rl\.(train|tune) ", line)]
+
+
+COMMANDS = sorted({line for path in TEXTS for line in commands(path.read_text())})
+
+
+def ids(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 150
+
+
+@pytest.mark.parametrize("path", [*TEXTS, *NOTEBOOKS], ids=ids)
+def test_every_link_leads_to_a_file(path):
+    missing = [link for link in LINK.findall(path.read_text()) if not (path.parent / link).is_file()]
+    assert not missing
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=ids)
+def test_every_file_that_is_named_exists(path):
+    missing = [name for name in NAMED.findall(path.read_text()) if not (ROOT / name).exists()]
+    assert not missing
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=ids)
+def test_no_line_of_code_is_lost_in_prose(path):
+    """Each opened fence is closed, so that no page swallows the rest of itself."""
+    assert path.read_text().count("\n```") % 2 == 0
+
+
+@pytest.mark.parametrize("line", [line for line in COMMANDS if "$" not in line and "resume=" not in line])
+def test_every_command_composes(line):
+    """Hydra knows all groups and keys of a command; of a sweep the first combination is taken."""
+    _, _, module, *words = shlex.split(line, comments=True)
+    parser = OverridesParser.create()
+    overrides = []
+    for word in words:
+        if word == "-m" or word.startswith("--"):
+            continue
+        override = parser.parse_override(word)
+        if override.is_sweep_override():
+            word = f"{word.partition('=')[0]}={next(override.sweep_string_iterator())}"
+        if not word.startswith("hydra"):
+            overrides.append(word)
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose(module.rpartition(".")[2], overrides)
+    OmegaConf.to_container(config, resolve=True)
+
+
+def test_there_are_commands():
+    assert len(COMMANDS) > 10
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning(tmp_path):
+    line = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", str(ROOT / "docs"), str(tmp_path / "html")]
+    done = subprocess.run(line, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "html" / "reference.html").is_file()
