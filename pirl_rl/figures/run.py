@@ -31,8 +31,6 @@ HELD_OUT = {
 WEIGHTS = {"td_weight": "TD", "hjb_weight": "HJB", "boundary_weight": "boundary"}
 STYLES = {"TD": "C0-", "HJB": "C1-", "boundary": "C2--", "HJB, sup over u": "C3--", "MSE of V": "C4-"}
 DPI = 110
-FIGURES = "figures"
-"""Where a run directory keeps them."""
 ERRORS = (1e-4, 1.0)
 """Colour scale of absolute errors, logarithmic: the corner would else hide all others."""
 

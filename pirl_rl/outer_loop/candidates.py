@@ -13,18 +13,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pirl_rl import checkpoint
-from pirl_rl.commands.console import INTERRUPTED
-from pirl_rl.errors import ConfigError
+from pirl_rl.errors import INTERRUPTED, ConfigError
 from pirl_rl.files import replacing
 from pirl_rl.outer_loop.history import Result
 from pirl_rl.outer_loop.plan import Candidate
 from pirl_rl.outer_loop.processes import Job
 from pirl_rl.outer_loop.redaction import redact
-from pirl_rl.runs.load import refuse_links
+from pirl_rl.run_directory import RunDirectory
 from pirl_rl.schedules import LossSchedule
 
-SUMMARY, FAILED = "summary.json", "failed.json"
+FAILED = "failed.json"
+"""Beside a run's own files: the exit code and the last lines of a candidate that ended with an error."""
+
 JUDGED = ("reward", "calibration_mae")
 """What every result must have."""
 
@@ -64,8 +64,16 @@ class Task:
         return self.folder.with_name(f"{self.folder.name}.log")
 
     @property
+    def run(self) -> RunDirectory:
+        return RunDirectory(self.folder)
+
+    @property
+    def failure(self) -> Path:
+        return self.folder / FAILED
+
+    @property
     def ended(self) -> bool:
-        return any((self.folder / name).is_file() for name in (SUMMARY, FAILED))
+        return self.run.summary.is_file() or self.failure.is_file()
 
     @property
     def schedule(self) -> LossSchedule:
@@ -109,7 +117,7 @@ def job(task: Task, settings: Sequence[str], trust: Sequence[str]) -> Job:
         trust: modules outside the package; one that goes on names them again.
     """
     train = [sys.executable, "-m", "pirl_rl.train"]
-    if (task.folder / checkpoint.FOLDER / checkpoint.LAST).is_file():
+    if task.run.last.is_file():
         command = [*train, f"resume={task.folder}", f"trust=[{','.join(trust)}]"]
     else:
         _clear(task.folder)
@@ -125,7 +133,7 @@ def _clear(folder: Path) -> None:
     if folder.is_symlink():
         raise ConfigError(f"{folder}: expected a run directory, got a link")
     if folder.exists():
-        refuse_links(folder)
+        RunDirectory(folder).refuse_links()
         shutil.rmtree(folder)
 
 
@@ -139,24 +147,24 @@ def settle(task: Task, code: int) -> None:
     if (clean := redact(text)) != text:
         with replacing(task.log) as file:
             file.write(clean)
-    if (task.folder / SUMMARY).is_file():
+    if task.run.summary.is_file():
         return
     if code in STOPPED:
         raise KeyboardInterrupt(f"{task.name} was stopped")
     lines = [line for line in clean.splitlines() if line.strip()]
-    with replacing(task.folder / FAILED) as file:
+    with replacing(task.failure) as file:
         json.dump({"exit_code": code, "log": lines[-LAST_LINES:]}, file, indent=2)
 
 
 def result(task: Task) -> Result:
     """What became of a candidate that has ended."""
-    if not (task.folder / SUMMARY).is_file():
-        failure = json.loads((task.folder / FAILED).read_text(encoding="utf-8"))
+    if not task.run.summary.is_file():
+        failure = json.loads(task.failure.read_text(encoding="utf-8"))
         last = failure["log"][-1] if failure["log"] else "no word"
         # Later prompts quote it, and no path is to enter a prompt.
         reason = re.sub(r"\S*/\S*", "<path>", last)[:300]
         return _result(task, task.updates, status="failed", reason=f"exit code {failure['exit_code']}: {reason}")
-    summary = json.loads((task.folder / SUMMARY).read_text(encoding="utf-8"))
+    summary = json.loads(task.run.summary.read_text(encoding="utf-8"))
     metrics = {name: value for name, value in summary.items() if name not in TIMES and math.isfinite(value)}
     if missing := [name for name in JUDGED if name not in metrics]:
         reason = f"{', '.join(missing)}: expected a finite number, got {summary.get(missing[0])}"

@@ -12,7 +12,7 @@ from pathlib import Path
 from omegaconf import OmegaConf
 
 from pirl_rl.errors import ConfigError
-from pirl_rl.runs.load import refuse_links
+from pirl_rl.run_directory import RunDirectory
 
 KEPT = "tune.yaml"
 """The settings that a loop began with."""
@@ -35,7 +35,7 @@ def check(out: Path, settings: dict) -> None:
         if any(not path.name.startswith(".") for path in out.iterdir()):
             raise ConfigError(f"out: {out} is not empty and no loop's directory, expected {KEPT} in it")
         return
-    refuse_links(out)
+    RunDirectory(out).refuse_links()
     before = OmegaConf.to_container(OmegaConf.load(out / KEPT))
     differing = [key for key in _differing(before, settings) if key not in CHANGEABLE]
     if differing:

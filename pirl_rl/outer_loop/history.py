@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 from pirl_rl.outer_loop.plan import Candidate, Frozen, Triple
@@ -74,3 +75,9 @@ class History(Frozen):
     def checkpoints(self) -> dict[str, Result]:
         """All that a plan may start from, by name."""
         return {one.checkpoint: one for one in (self.baseline, *self.results) if one.checkpoint is not None}
+
+
+def tolerance(baseline: Result) -> float:
+    """The 95% half-width of the difference of two success rates such as the baseline's."""
+    low, high = (baseline.metrics[name] for name in ("success_low", "success_high"))
+    return math.sqrt(2) * (high - low) / 2

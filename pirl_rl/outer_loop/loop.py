@@ -30,7 +30,7 @@ LONGEST_ANSWER, LONGEST_ERROR = 20_000, 2_000
 
 
 @dataclass(frozen=True)
-class Settings:
+class LoopSettings:
     """What a loop is to do.
 
     Attributes:
@@ -66,7 +66,7 @@ class Loop:
         launcher: runs the candidates' command lines.
     """
 
-    def __init__(self, settings: Settings, record: Record, advisor: Advisor, launcher: Launcher):
+    def __init__(self, settings: LoopSettings, record: Record, advisor: Advisor, launcher: Launcher):
         self.settings, self.record, self.advisor, self.launcher = settings, record, advisor, launcher
 
     def run(self, history: History) -> History:
@@ -157,9 +157,9 @@ class Loop:
             if fallback:
                 raise
             reasons = error.errors if isinstance(error, PlanError) else [f"{type(error).__name__}: {error}"]
-            told = [redact(reason)[:LONGEST_ERROR] for reason in reasons]
-            print(f"round {request.number}: {name} gave no plan: {'; '.join(told)[:500]}", flush=True)
-            return Attempt(advisor=name, answer=str(answer)[:LONGEST_ANSWER], errors=told)
+            reasons = [redact(reason)[:LONGEST_ERROR] for reason in reasons]
+            print(f"round {request.number}: {name} gave no plan: {'; '.join(reasons)[:500]}", flush=True)
+            return Attempt(advisor=name, answer=str(answer)[:LONGEST_ANSWER], errors=reasons)
         text = answer if len(answer) <= LONGEST_ANSWER else plan.model_dump_json()
         return Attempt(advisor=name, answer=text)
 

@@ -55,8 +55,8 @@ def markdown(history: History) -> str:
         lines += [f"## Round {one.number}, {one.advisor}", "", f"> {_plain(one.note)}", ""]
         if one.fallback:
             lines += [f"The advisor that was asked gave no plan: {_plain(one.fallback)}", ""]
-        told = [f"- {node(result, one.number)}: {_plain(result.reason)}" for result in one.results if result.reason]
-        lines += [*told, ""] if told else []
+        reasons = [f"- {node(result, one.number)}: {_plain(result.reason)}" for result in one.results if result.reason]
+        lines += [*reasons, ""] if reasons else []
     return "\n".join(lines).rstrip() + "\n"
 
 

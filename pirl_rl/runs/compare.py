@@ -20,6 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from pirl_rl.errors import RunError
 from pirl_rl.figures.run import DPI, log_scale, read_metrics
+from pirl_rl.run_directory import RunDirectory
 
 LOSSES = ("td_loss", "hjb_loss", "hjb_sup_loss", "boundary_loss")
 COLUMNS = (
@@ -43,8 +44,8 @@ ERRORS = {"value_mse": "MSE against the exact V", "fine_mse_band": "MSE against 
 SHARE = "reward / optimal reward, where known"
 
 
-class Run(NamedTuple):
-    """One run directory: its group, its summary.json, and the columns of its metrics.csv."""
+class RunRecord(NamedTuple):
+    """What a finished run left: its group, the numbers of its summary, and the columns of its metrics."""
 
     label: str
     summary: dict[str, float]
@@ -59,20 +60,21 @@ class Run(NamedTuple):
         return math.nan if value is None else float(value)
 
 
-def find_runs(folders: Sequence[str | Path]) -> dict[str, list[Run]]:
+def find_runs(folders: Sequence[str | Path]) -> dict[str, list[RunRecord]]:
     """All runs below the folders by label, "experiment method", in the order of their paths.
 
     Raises:
         RunError: no run below a folder, or a run that cannot be read.
     """
-    groups: dict[str, list[Run]] = {}
+    groups: dict[str, list[RunRecord]] = {}
     paths: dict[Path, None] = {}
     for folder in map(Path, folders):
-        found = [path.parent for path in sorted(folder.rglob("summary.json"))]
-        found = [path for path in found if (path / ".hydra" / "config.yaml").is_file()]
+        found = [path.parent for path in sorted(folder.rglob(str(RunDirectory.SUMMARY)))]
+        found = [path for path in found if RunDirectory(path).config.is_file()]
         if not found:
             raise RunError(
-                f"no runs found below {folder}: expected directories with summary.json and .hydra/config.yaml"
+                f"no runs found below {folder}: expected directories with {RunDirectory.SUMMARY} and "
+                f"{RunDirectory.CONFIG}"
             )
         paths |= {path.resolve(): None for path in found}
     for path in paths:
@@ -81,25 +83,26 @@ def find_runs(folders: Sequence[str | Path]) -> dict[str, list[Run]]:
     return groups
 
 
-def read_run(path: Path) -> Run:
+def read_run(path: Path) -> RunRecord:
     """Open one run directory.
 
     Raises:
         RunError: with the file and the reason.
     """
+    run = RunDirectory(path)
     try:
-        config = OmegaConf.load(path / ".hydra" / "config.yaml")
+        config = OmegaConf.load(run.config)
         names = [OmegaConf.select(config, key, throw_on_missing=True) for key in ("experiment_name", "method_name")]
-        summary = json.loads((path / "summary.json").read_text())
-        metrics = read_metrics(path / "metrics.csv")
+        summary = json.loads(run.summary.read_text())
+        metrics = read_metrics(run.metrics)
     except (OSError, ValueError, OmegaConfBaseException) as error:
         raise RunError(f"{path} cannot be read: {error}") from error
     if None in names:
-        raise RunError(f"{path}/.hydra/config.yaml: expected the keys experiment_name and method_name")
-    return Run(" ".join(map(str, names)), summary, metrics)
+        raise RunError(f"{run.config}: expected the keys experiment_name and method_name")
+    return RunRecord(" ".join(map(str, names)), summary, metrics)
 
 
-def table(groups: dict[str, list[Run]]) -> str:
+def comparison_table(groups: dict[str, list[RunRecord]]) -> str:
     """A Markdown table, a row for each group; a dash where no run of the group has the number."""
     runs = [run for group in groups.values() for run in group]
     columns = [column for column in COLUMNS if any(math.isfinite(run.get(column[1])) for run in runs)]
@@ -114,7 +117,7 @@ def table(groups: dict[str, list[Run]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
 
 
-def draw(groups: dict[str, list[Run]]) -> Figure:
+def draw(groups: dict[str, list[RunRecord]]) -> Figure:
     """Reward and MSE of every run, one against the other, and the held-out losses over training."""
     figure = Figure(figsize=(15, 8), layout="constrained")
     grid = figure.add_gridspec(2, 12)
@@ -139,7 +142,7 @@ def draw(groups: dict[str, list[Run]]) -> Figure:
     return figure
 
 
-def _per_seed(axes: Axes, groups: dict[str, list[Run]], name: str, title: str, ylabel: str) -> None:
+def _per_seed(axes: Axes, groups: dict[str, list[RunRecord]], name: str, title: str, ylabel: str) -> None:
     for i, (color, runs) in enumerate(_colored(groups)):
         values = _finite([run.get(name) for run in runs])
         if len(values):
@@ -151,7 +154,7 @@ def _per_seed(axes: Axes, groups: dict[str, list[Run]], name: str, title: str, y
     axes.grid(axis="y", alpha=0.3)
 
 
-def _reward_against_mse(axes: Axes, groups: dict[str, list[Run]], error: str) -> None:
+def _reward_against_mse(axes: Axes, groups: dict[str, list[RunRecord]], error: str) -> None:
     for label, (color, runs) in zip(groups, _colored(groups), strict=True):
         pairs = np.array([(run.get(error), run.get("reward_share")) for run in runs])
         pairs = pairs[np.isfinite(pairs).all(-1)]
@@ -163,7 +166,7 @@ def _reward_against_mse(axes: Axes, groups: dict[str, list[Run]], error: str) ->
     axes.grid(alpha=0.3)
 
 
-def _evolution(axes: Axes, runs: list[Run], name: str, color: str) -> None:
+def _evolution(axes: Axes, runs: list[RunRecord], name: str, color: str) -> None:
     """Median and range over runs at every update at which one of them was evaluated."""
     at: dict[float, list[float]] = {}
     for run in runs:
@@ -177,7 +180,7 @@ def _evolution(axes: Axes, runs: list[Run], name: str, color: str) -> None:
     )
 
 
-def _colored(groups: dict[str, list[Run]]) -> list[tuple[str, list[Run]]]:
+def _colored(groups: dict[str, list[RunRecord]]) -> list[tuple[str, list[RunRecord]]]:
     return [(f"C{i % 10}", runs) for i, runs in enumerate(groups.values())]
 
 
@@ -206,7 +209,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.error(str(error))
     out = Path(options.out or options.folders[0])
     out.mkdir(parents=True, exist_ok=True)
-    text = table(groups)
+    text = comparison_table(groups)
     (out / "comparison.md").write_text(text)
     draw(groups).savefig(out / "comparison.png", dpi=DPI)
     print(text)

@@ -19,11 +19,11 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from pirl_rl.errors import RunError
-from pirl_rl.runs.compare import number, read_run
-from pirl_rl.figures.sweep import draw_grid, draw_line
 from pirl_rl.figures.run import save_figures
+from pirl_rl.figures.sweep import draw_grid, draw_line
+from pirl_rl.run_directory import RunDirectory
+from pirl_rl.runs.compare import number, read_run
 
-OVERRIDES = Path(".hydra") / "overrides.yaml"
 AVERAGED = "seed"
 UNSET = "default"
 """Stands for the value of a setting in the runs in which it was not typed."""
@@ -72,8 +72,8 @@ def find_jobs(folder: Path) -> list[Job]:
         RunError: there is none, or one that cannot be read.
     """
     jobs = []
-    for path in sorted(folder.rglob(str(OVERRIDES))):
-        run = path.parents[1]
+    for path in sorted(folder.rglob(str(RunDirectory.OVERRIDES))):
+        run = RunDirectory(path.parents[1])
         try:
             typed = OmegaConf.to_container(OmegaConf.load(path))
         except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException) as error:
@@ -81,9 +81,9 @@ def find_jobs(folder: Path) -> list[Job]:
         if not isinstance(typed, list):
             raise RunError(f"{path}: expected a list of overrides, got {type(typed).__name__}")
         settings = {key.lstrip("+~"): _plain(value) for key, _, value in (str(item).partition("=") for item in typed)}
-        jobs.append(Job(settings, read_run(run).summary if (run / "summary.json").is_file() else {}))
+        jobs.append(Job(settings, read_run(run.path).summary if run.summary.is_file() else {}))
     if not jobs:
-        raise RunError(f"no runs found below {folder}: expected directories with {OVERRIDES}")
+        raise RunError(f"no runs found below {folder}: expected directories with {RunDirectory.OVERRIDES}")
     return jobs
 
 
@@ -135,7 +135,7 @@ def _order(value: str) -> tuple[bool, float, str]:
         return True, 0.0, value
 
 
-def table(sweep: Sweep) -> str:
+def sweep_table(sweep: Sweep) -> str:
     """A Markdown table: a row for each value of the first setting, a column for each of the second."""
     rows, columns = next(iter(sweep.axes)), dict(list(sweep.axes.items())[1:])
     [(second, values)] = columns.items() or [("", [])]
@@ -173,7 +173,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.error(str(error))
     out = options.out or options.folder
     out.mkdir(parents=True, exist_ok=True)
-    text = table(sweep)
+    text = sweep_table(sweep)
     (out / "sweep.md").write_text(text)
     [figure] = save_figures({"sweep": draw(sweep)}, out)
     print(text)
