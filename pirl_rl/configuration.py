@@ -85,6 +85,8 @@ def resolve(target: str, key: str, trust: Sequence[str] = ()) -> Any:
             f"trust=[{target.rpartition('.')[0] or target}]"
         )
     module, _, name = target.rpartition(".")
+    if not module:
+        raise ConfigError(f"{key}: expected a class as module.Name, got {target}")
     try:
         # Any other error while a module is imported is a bug in it.
         found = getattr(importlib.import_module(module), name)

@@ -15,7 +15,8 @@ from omegaconf import OmegaConf
 from small import QUICK, command
 
 from pirl_rl import __main__, load_run, train
-from pirl_rl.configuration import CONF, CONFIG, load_config
+from pirl_rl.configuration import CONF, load_config
+from pirl_rl.run_directory import RunDirectory
 
 OWN = """
 import torch
@@ -206,7 +207,7 @@ def test_resume_writes_nowhere_else(finished, cli, tmp_path):
 
 
 def test_resume_ignores_what_the_directory_trusts(finished, cli):
-    path, before = finished / CONFIG, (finished / CONFIG).read_text()
+    path, before = RunDirectory(finished).config, RunDirectory(finished).config.read_text()
     hostile = OmegaConf.create(before)
     hostile.trust = ["os"]
     hostile.logger = {"_target_": "os.system", "command": "touch ran"}
@@ -219,11 +220,11 @@ def test_resume_ignores_what_the_directory_trusts(finished, cli):
 
 
 def test_a_run_is_never_overwritten(finished, cli):
-    before = (finished / CONFIG).read_bytes()
+    before = RunDirectory(finished).config.read_bytes()
     code, text = cli(*QUICK, "seed=5", f"hydra.run.dir={finished}")
     assert code == 1
     assert "never overwrites" in text
-    assert (finished / CONFIG).read_bytes() == before
+    assert RunDirectory(finished).config.read_bytes() == before
 
 
 def test_sweep_goes_on_after_a_bad_job(cli, tmp_path):
