@@ -93,7 +93,7 @@ class RunDirectory:
         Raises:
             CheckpointError: the name leads elsewhere.
         """
-        if Path(name).name != name:
+        if name in ("", "..") or Path(name).name != name:
             raise CheckpointError(f"weights: expected the name of a file in {self.checkpoints}, got {name}")
         return self.checkpoints / name
 

@@ -93,9 +93,9 @@ def typed_settings(
     texts = []
     for name, value in settings.items():
         first = name.partition(".")[0]
-        if first in config:
+        if first in config.keys():
             key = name
-        elif first in config[short]:
+        elif first in config[short].keys():
             key = f"{short}.{name}"
         else:
             known = sorted({*map(str, config), *(str(key) for key in config[short] if key != "_target_"), *groups})
@@ -121,7 +121,7 @@ def _check(key: str, config: DictConfig) -> None:
     """
     node: Any = config
     for count, part in enumerate(parts := key.split("."), 1):
-        if not isinstance(node, DictConfig) or part not in node:
+        if not isinstance(node, DictConfig) or part not in node.keys():  # even without a value
             known = ", ".join(str(name) for name in node) if isinstance(node, DictConfig) else "no more names"
             raise ConfigError(f"{'.'.join(parts[:count])}: expected one of {known}")
         node = node._get_node(part)

@@ -118,7 +118,7 @@ class Run:
         steps = _steps(self._simulator(dt, substeps, crossing))
         policy = self.solution.policy
         found = monte_carlo(self.problem, policy, times, state, rollouts, **steps, seed=seed, confidence=confidence)
-        ends = (answer(entry) for entry in (found.probability, found.low, found.high))
+        ends = (answer(torch.as_tensor(entry)) for entry in (found.probability, found.low, found.high))
         return Estimate(*ends, rollouts=found.rollouts)
 
     def _simulator(self, dt: float | None, substeps: int | None, crossing: Crossing | None) -> Simulator:
