@@ -61,8 +61,7 @@ class PIRLLoss(TD3Loss):
         td_weight, hjb_weight, boundary_weight: initial weights of the three terms.
 
     Raises:
-        ValueError: an unknown actor rule, or one that lacks what it needs.
-        TypeError: a critic with an activation that is not C^2.
+        ArgumentError: an unknown actor rule, one that lacks what it needs, or a critic whose activation is not C^2.
     """
 
     _schedulable_buffers = frozenset(WEIGHTS)

@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives import TD3Loss
 
+from pirl_rl.errors import ArgumentError
 from pirl_rl.losses import WEIGHTS, PIRLLoss
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.operators import advection
@@ -503,7 +504,7 @@ def test_an_unknown_rule_is_named():
 
 def test_a_relu_critic_is_refused_by_name():
     problem = Reach1D()
-    with pytest.raises(TypeError, match="got ReLU"):
+    with pytest.raises(ArgumentError, match="got ReLU"):
         PIRLLoss(problem, Actor(problem), [Critic(problem, (4,), "ReLU")])
 
 

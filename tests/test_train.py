@@ -14,7 +14,8 @@ import torch
 from omegaconf import OmegaConf
 from small import QUICK, command
 
-from pirl_rl import __main__, load_run, train
+from pirl_rl import load_run, train
+from pirl_rl.commands import catalogue
 from pirl_rl.configuration import CONF, load_config
 from pirl_rl.run_directory import RunDirectory
 
@@ -308,8 +309,8 @@ def test_installed_wheel_in_an_empty_directory(tmp_path):
 
 
 def test_catalogue_lists_what_there_is():
-    text = __main__.catalogue()
-    for group in __main__.GROUPS:
+    text = catalogue.catalogue()
+    for group in catalogue.GROUPS:
         for name in names(group):
             [line] = [line for line in text.splitlines() if line.split()[:1] == [name]]
             assert len(line.split()) > 2, f"conf/{group}/{name}.yaml needs a comment that says what it is"
