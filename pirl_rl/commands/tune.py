@@ -39,19 +39,19 @@ from pirl_rl.run_directory import RunDirectory
 from pirl_rl.trainer import Trainer
 
 COUNTS = {"rounds": 1, "extra_rounds": 0, "candidates": 1, "updates": 1, "parallel": 1}
-"""The loop's numbers and the least of each."""
+"""Settings of the loop that are integers, with the least value of each."""
 
 OWN = ("start", "out", "advisor", *COUNTS)
 """Settings of the loop itself; all others are those of its candidates."""
 
 PLANNED = ("schedule", "stages", "resume", "trainer.updates", "evaluation.final")
-"""Settings that the loop gives to its candidates."""
+"""Settings that the loop itself gives to its candidates, and that nobody may type."""
 
 EVALUATIONS = 10
-"""Of a candidate, at least: the guard, which stops one that collapses, sees nothing between them."""
+"""Least number of evaluations during a candidate's training: between them the guard cannot see a collapse."""
 
 JUDGES = ("success", "residuals", "calibration")
-"""Evaluators of baseline and candidates."""
+"""Evaluators that judge the baseline and the candidates."""
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="tune")

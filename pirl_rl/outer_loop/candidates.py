@@ -26,16 +26,16 @@ FAILED = "failed.json"
 """Beside a run's own files: the exit code and the last lines of a candidate that ended with an error."""
 
 JUDGED = ("reward", "calibration_mae")
-"""What every result must have."""
+"""Metrics that every result must have."""
 
 TIMES = ("updates", "wall_seconds", "updates_per_second")
-"""Not of a summary's metrics: the same candidate run again has other ones."""
+"""Entries of a summary that are no metrics: they differ when the same candidate is trained again."""
 
 STOPPED = (INTERRUPTED, *(-number for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)))
-"""Exit codes of one that was asked to stop, and can go on."""
+"""Exit codes of a candidate that was asked to stop and can go on."""
 
 LEADING = ("trainer.rollback=true",)
-"""Settings of a candidate's training that the user's may change."""
+"""Settings of a candidate's training that stand before the user's own, which may change them."""
 
 LAST_LINES = 20
 
@@ -47,9 +47,9 @@ class Task:
     Attributes:
         name: "<round>/<candidate>".
         folder: its run directory; the log lies beside it, as a new run directory must be empty.
-        candidate: of the plan.
-        start: the result that it starts from, at `path`.
-        updates: its length.
+        candidate: its entry in the plan.
+        start: the result from which it goes on; its run or checkpoint lies at `path`.
+        updates: length of its training.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Who may work in a loop's directory: one loop at a time, with the settings that it began with."""
+"""The directory of an outer loop: one loop works in it at a time, always with the settings of its first start."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from pirl_rl.errors import ConfigError
 from pirl_rl.run_directory import RunDirectory
 
 KEPT = "tune.yaml"
-"""The settings that a loop began with."""
+"""The file with the settings of the loop's first start."""
 
 CHANGEABLE = ("rounds", "extra_rounds", "parallel", "out")
-"""Those that may be others when it goes on."""
+"""Settings that may differ when the loop is started again."""
 
 LOCK = ".lock"
 PATIENCE = 30.0

@@ -26,7 +26,7 @@ ASKED = 2
 """Times that an advisor is asked before the fallback steps in."""
 
 LONGEST_ANSWER, LONGEST_ERROR = 20_000, 2_000
-"""Characters of what is recorded of each."""
+"""Characters of an answer and of an error that are recorded."""
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,11 @@ class LoopSettings:
     """What a loop is to do.
 
     Attributes:
-        rounds: up to the milestone.
-        candidates: of a round.
-        updates: of a candidate.
-        extra_rounds: past the milestone, as long as the round before found a new best.
-        start: the checkpoint that all begins from.
+        rounds: number of rounds up to the milestone.
+        candidates: number of candidates in each round.
+        updates: length of each candidate's training.
+        extra_rounds: further rounds past the milestone, each only if the round before found a new best.
+        start: the checkpoint from which the loop goes on.
         train: the user's overrides of every candidate's training.
         trust: modules outside the package that these name.
         final: names of the evaluators that judge a candidate.
@@ -60,7 +60,7 @@ class Loop:
     """Rounds of continuations.
 
     Args:
-        settings: how many.
+        settings: number of rounds and candidates, and how candidates are trained.
         record: where everything is kept and found again.
         advisor: plans; `Greedy` steps in for one that fails.
         launcher: runs the candidates' command lines.
