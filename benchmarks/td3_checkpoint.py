@@ -19,6 +19,7 @@ from pirl_rl import checkpoint
 from pirl_rl.assembly import make_loss
 from pirl_rl.configuration import CONF, save_config
 from pirl_rl.problems import VehicleDrift
+from pirl_rl.run_directory import RunDirectory
 
 
 def main() -> None:
@@ -45,8 +46,7 @@ def main() -> None:
     own = {name: entry for name, entry in state.items() if not name.startswith(checkpoint.TARGET)}
     loss.load_state_dict(checkpoint.loss_state({"loss": own}))
     save_config(config, arguments.folder)
-    path = checkpoint.weights_path(arguments.folder / checkpoint.FOLDER, update)
-    checkpoint.save({"loss": own, "update": update}, path)
+    checkpoint.save({"loss": own, "update": update}, RunDirectory(arguments.folder).weights(update))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,70 @@
-"""Stochastic reach-avoid analysis of controlled systems by physics-informed reinforcement learning."""
+"""Stochastic reach-avoid analysis of controlled systems by physics-informed reinforcement learning.
 
-from pirl_rl.evaluation.monte_carlo import monte_carlo
-from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.runs.load import Run, load_run
-from pirl_rl.sets import Box
+Names are imported on first use, so that `import pirl_rl` itself loads nothing, torch included.
+"""
 
-__all__ = ["Box", "ReachAvoidProblem", "Run", "load_run", "monte_carlo"]
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pirl_rl import problems as problems
+    from pirl_rl.api import check, evaluate, load_run, monte_carlo, train
+    from pirl_rl.losses import PIRLLoss
+    from pirl_rl.operators import generator
+    from pirl_rl.problem import ReachAvoidProblem
+    from pirl_rl.runs.load import Run
+    from pirl_rl.sets import Box, Plane, band, complement, difference, intersection, union
+    from pirl_rl.simulator import Simulator
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Box",
+    "PIRLLoss",
+    "Plane",
+    "ReachAvoidProblem",
+    "Run",
+    "Simulator",
+    "__version__",
+    "band",
+    "check",
+    "complement",
+    "difference",
+    "evaluate",
+    "generator",
+    "intersection",
+    "load_run",
+    "monte_carlo",
+    "problems",
+    "train",
+    "union",
+]
+
+_HOMES = {
+    **dict.fromkeys(("check", "load_run", "monte_carlo"), "pirl_rl.api"),
+    **dict.fromkeys(("Box", "Plane", "band", "complement", "difference", "intersection", "union"), "pirl_rl.sets"),
+    "PIRLLoss": "pirl_rl.losses",
+    "generator": "pirl_rl.operators",
+    "ReachAvoidProblem": "pirl_rl.problem",
+    "Run": "pirl_rl.runs.load",
+    "Simulator": "pirl_rl.simulator",
+}
+"""The module of each name."""
+
+_MODULES = ("problems", "train", "evaluate")
+"""Names of modules; the latter two are commands, and the functions of the same name when they are called."""
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        value = getattr(import_module(_HOMES[name]), name)
+    elif name in _MODULES:
+        value = import_module(f"{__name__}.{name}")
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

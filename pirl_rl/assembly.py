@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -10,16 +11,18 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 
 from pirl_rl import checkpoint
+from pirl_rl.checkpoint import check_entries, check_module
 from pirl_rl.configuration import build, convert
 from pirl_rl.curriculum import Stage
 from pirl_rl.envs import ReachAvoidEnv
-from pirl_rl.errors import CheckpointError, ConfigError
+from pirl_rl.errors import ArgumentError, CheckpointError, ConfigError
 from pirl_rl.evaluation import Evaluator
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.run_directory import RunDirectory
 from pirl_rl.simulator import Simulator
 from pirl_rl.trainer import Trainer
 
@@ -47,8 +50,37 @@ def make_networks(
     return actor, [build(config.critic, "critic", trust, problem=problem).to(device) for _ in range(count)]
 
 
-def make_trainer(config: DictConfig, folder: Path | None = None, trust: Sequence[str] = ()) -> Trainer:
+def make_simulator(config: DictConfig, problem: ReachAvoidProblem) -> Simulator:
+    """The simulator that the training environment plays."""
+    steps = {name: config.env[name] for name in ("dt", "substeps", "crossing") if name in config.env}
+    return Simulator(problem, **steps)
+
+
+def make_problem(config: DictConfig, trust: Sequence[str] = ()) -> ReachAvoidProblem:
+    """The problem that a configuration names.
+
+    Raises:
+        ConfigError: it names none, as that of a run on an object that only Python code has.
+    """
+    node = config.env.problem
+    if isinstance(node, DictConfig) and OmegaConf.is_missing(node, "_target_"):
+        raise ConfigError(
+            "env.problem._target_: a value is missing, give env.problem._target_=my_module.MyProblem; a run that was "
+            "trained on an object of Python code opens with load_run(folder, problem=...)"
+        )
+    return build(node, "env.problem", trust)
+
+
+def make_trainer(
+    config: DictConfig, folder: Path | None = None, trust: Sequence[str] = (), problem: ReachAvoidProblem | None = None
+) -> Trainer:
     """Everything a configuration names, put together; nothing is written yet.
+
+    Args:
+        config: all settings.
+        folder: the run directory; None keeps everything in memory.
+        trust: modules outside the package that the configuration may name.
+        problem: what is trained on in place of `env.problem`.
 
     Raises:
         ConfigError: naming the key, what was expected and what was got.
@@ -60,14 +92,15 @@ def make_trainer(config: DictConfig, folder: Path | None = None, trust: Sequence
     # Independent streams: the noise of the physics, the policy, sampling and collocation must not repeat each other.
     networks, physics, sampling, points = (int(word) for word in np.random.SeedSequence(seed).generate_state(4))
     torch.manual_seed(networks)
-    env: ReachAvoidEnv = build(config.env, "env", trust, seed=physics, device=device)
-    parts = {"problem": env.problem, "simulator": env.simulator}
-    actor, critics = make_networks(config, env.problem, trust)
+    problem = make_problem(config, trust) if problem is None else problem
+    env: ReachAvoidEnv = build(_without_problem(config), "env", trust, problem=problem, seed=physics, device=device)
+    parts = {"problem": problem, "simulator": env.simulator}
+    actor, critics = make_networks(config, problem, trust)
     with warnings.catch_warnings():
         # The learner makes the updater of the target networks after the loss.
         warnings.filterwarnings("ignore", message="No target network updater")
         # The networks are on their device already: moving the loss alone would leave it buffers of its own.
-        loss = build(config.loss, "loss", trust, parts, problem=env.problem, actor=actor, critics=critics).to(device)
+        loss = build(config.loss, "loss", trust, parts, problem=problem, actor=actor, critics=critics).to(device)
     return build(
         config.trainer,
         "trainer",
@@ -86,6 +119,14 @@ def make_trainer(config: DictConfig, folder: Path | None = None, trust: Sequence
         config=OmegaConf.to_container(config, resolve=True),
         seed=points,
     )
+
+
+def _without_problem(config: DictConfig) -> DictConfig:
+    """The environment's settings beside the problem, in a copy of all settings, to which they may refer."""
+    others = copy.deepcopy(config)
+    with open_dict(others):
+        others.env.pop("problem", None)
+    return others.env
 
 
 def _make_stage(node: DictConfig, key: str, trust: Sequence[str], parts: Mapping[str, Any]) -> Stage:
@@ -113,16 +154,23 @@ def restore(trainer: Trainer) -> None:
 
     Raises:
         CheckpointError: none there, a broken one, or one of another configuration.
+        ConfigError: the run is further than `trainer.updates` already.
     """
     assert trainer.folder is not None
-    path = trainer.folder / checkpoint.FOLDER / checkpoint.LAST
+    path = RunDirectory(trainer.folder).last
+    state = checkpoint.load(path)
     with fitting(path):
-        trainer.load_state_dict(checkpoint.load(path))
+        expected = trainer.state_dict()
+        if state.get("rollback") is None:
+            del expected["rollback"]  # the guard may watch from here on
+        _check_learner(state, expected.pop("learner"))
+        check_entries(state, expected)
+    trainer.load_state_dict(state)
     if trainer.update > trainer.updates:
         raise ConfigError(f"trainer.updates: {trainer.folder} has done {trainer.update} already, got {trainer.updates}")
 
 
-def begin(trainer: Trainer, start: str) -> Path:
+def start_from(trainer: Trainer, start: str) -> Path:
     """Give a new trainer the networks and targets of another run, and from a `last.pt` its optimisers and transitions.
 
     The transitions of a run that collapsed are those of spoilt networks: they stay behind.
@@ -137,28 +185,36 @@ def begin(trainer: Trainer, start: str) -> Path:
     Raises:
         CheckpointError: none there, a broken one, or one of another configuration.
     """
-    path = checkpoint.newest(Path(start)) if Path(start).is_dir() else Path(start)
+    path = RunDirectory(start).newest() if Path(start).is_dir() else Path(start)
     state = checkpoint.load(path)
+    learner, buffer = trainer.learner, None
     with fitting(path):
         if "learner" in state:
-            trainer.learner.load_state_dict(state["learner"])
+            _check_learner(state, learner.state_dict())
+            learner.load_state_dict(state["learner"])
         else:
-            trainer.learner.loss.load_state_dict(checkpoint.loss_state(state))
+            networks = checkpoint.loss_state(state)
+            check_module(networks, learner.loss.state_dict())
+            learner.loss.load_state_dict(networks)
         collapsed = (state.get("rollback") or {}).get("collapsed_at") is not None
-        trainer.collector.warm_start(state["collector"]["buffer"] if "collector" in state and not collapsed else None)
-    trainer.learner.check_parameters(0)
+        if "collector" in state and not collapsed:
+            check_entries(state["collector"], {"buffer": {"transitions": {}, "writer": {}}}, "collector")
+            buffer = state["collector"]["buffer"]
+        trainer.collector.warm_start(buffer)
+    learner.check_parameters(0)
     return path.absolute()
+
+
+def _check_learner(state: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
+    rest = {name: entry for name, entry in expected.items() if name != "loss"}
+    check_entries(state, {"learner": rest})
+    check_module(state["learner"]["loss"], expected["loss"])
 
 
 @contextmanager
 def fitting(path: Path) -> Iterator[None]:
-    """Whatever does not fit while a checkpoint is loaded is told as such."""
+    """An argument that is refused while a checkpoint is checked and loaded becomes an error that names the file."""
     try:
         yield
-    except CheckpointError:
-        raise
-    except (RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
-        reason = " ".join(str(error).split())[:300]
-        if isinstance(error, KeyError):
-            reason = f"no entry {reason}; a file of checkpoints/weights-* holds networks alone and may still do"
-        raise CheckpointError(f"{path} does not fit the run's configuration: {reason}") from error
+    except ArgumentError as error:
+        raise CheckpointError(f"{path} does not fit the run's configuration: {error}") from error

@@ -7,18 +7,17 @@ so that a foreign file runs no code.
 from __future__ import annotations
 
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from pirl_rl.errors import CheckpointError
+from pirl_rl.errors import ArgumentError, CheckpointError
 from pirl_rl.files import replacing
 
-FOLDER = "checkpoints"
-LAST = "last.pt"
 TARGET = "target_"
-"""Begins the names of the target networks' parameters, which may be missing where nothing is trained further."""
+"""Prefix of the names of the target networks' parameters, which may be missing where nothing is trained further."""
 
 
 def save(state: dict[str, Any], path: Path) -> None:
@@ -45,10 +44,6 @@ def load(path: Path) -> dict[str, Any]:
     return state
 
 
-def weights_path(folder: Path, update: int) -> Path:
-    return folder / f"weights-{update:09d}.pt"
-
-
 def loss_state(state: dict[str, Any]) -> dict[str, Any]:
     """The loss module's state; the networks themselves stand for targets that are missing."""
     loss = state.get("learner", state)["loss"]
@@ -67,6 +62,54 @@ def network_states(state: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any
     return actor, critics
 
 
+def check_module(state: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
+    """Refuse networks of other names or shapes; targets that the module does not have are left out by it.
+
+    Args:
+        state: of the checkpoint.
+        expected: the module's own state.
+
+    Raises:
+        ArgumentError: naming the first entry that is missing, too many, or of another shape.
+    """
+    check_entries(state, expected, "loss")
+    for name in state.keys() - expected.keys():
+        if not name.startswith(TARGET):
+            raise ArgumentError(f"loss.{name}: expected no such entry")
+
+
+def check_entries(state: Any, expected: Any, key: str = "") -> None:
+    """Refuse a state that lacks an entry of the expected one, or has a tensor of another shape; it may hold more.
+
+    States of random generators depend on their device and are not compared.
+
+    Raises:
+        ArgumentError: naming the first such entry.
+    """
+    if key.endswith("rng"):
+        return
+    if isinstance(expected, Mapping):
+        if not isinstance(state, Mapping):
+            raise ArgumentError(f"{key}: expected a mapping, got {type(state).__name__}")
+        for name, entry in expected.items():
+            if name not in state:
+                raise ArgumentError(
+                    f"no entry {f'{key}.{name}'.lstrip('.')}; a file of checkpoints/weights-* holds networks alone and "
+                    "may still do"
+                )
+            check_entries(state[name], entry, f"{key}.{name}".lstrip("."))
+    elif isinstance(expected, list):
+        if not isinstance(state, list) or len(state) != len(expected):
+            got = len(state) if isinstance(state, list) else type(state).__name__
+            raise ArgumentError(f"{key}: expected {len(expected)} entries, got {got}")
+        for index, pair in enumerate(zip(state, expected, strict=True)):
+            check_entries(*pair, f"{key}[{index}]")
+    elif isinstance(expected, torch.Tensor):
+        shape = tuple(state.shape) if isinstance(state, torch.Tensor) else type(state).__name__
+        if shape != tuple(expected.shape):
+            raise ArgumentError(f"{key}: expected shape {tuple(expected.shape)}, got {shape}")
+
+
 def restore_rng(rng: torch.Generator, state: torch.Tensor) -> None:
     """Put a random generator back where it was.
 
@@ -76,10 +119,3 @@ def restore_rng(rng: torch.Generator, state: torch.Tensor) -> None:
         rng.set_state(state)
     else:
         rng.manual_seed(zlib.crc32(state.numpy().tobytes()))
-
-
-def newest(run: Path) -> Path:
-    """The file of a run directory with its last weights: `last.pt`, or in an exported one the last `weights-*.pt`."""
-    folder = run / FOLDER
-    kept = sorted(folder.glob("weights-*.pt"))
-    return kept[-1] if kept and not (folder / LAST).exists() else folder / LAST

@@ -11,7 +11,7 @@ import importlib
 import inspect
 import re
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +21,14 @@ import yaml
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from pirl_rl.errors import ConfigError
+from pirl_rl.errors import ConfigError, PirlError
 from pirl_rl.files import replacing
+from pirl_rl.renames import upgraded
+from pirl_rl.run_directory import FORMAT, RunDirectory
 
 PACKAGE = Path(__file__).resolve().parent
 CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"
 """Where the configuration lies: inside an installed package, or beside it in a checkout."""
-
-CONFIG = Path(".hydra") / "config.yaml"
-"""Where a run directory keeps its own."""
 
 REFERENCE = re.compile(r"\$\{[\w.]+\}")
 CHECKED = (bool, int, float, str, type(None))
@@ -46,7 +45,8 @@ def build(node: Any, key: str, trust: Sequence[str] = (), parts: Mapping[str, An
         extra: constructor arguments of this object that no configuration can hold.
 
     Raises:
-        ConfigError: an unknown or forbidden target, an unknown key, a wrong type, or a constructor's refusal.
+        ConfigError: an unknown or forbidden target, an unknown key, a wrong type, or a constructor's refusal, which is
+            a `PirlError`. Any other error of a constructor is a bug, ours or the user's, and is left as it is.
     """
     if not isinstance(node, DictConfig) or "_target_" not in node:
         raise ConfigError(f"{key}: expected settings with a _target_, got {node!r}")
@@ -54,9 +54,11 @@ def build(node: Any, key: str, trust: Sequence[str] = (), parts: Mapping[str, An
     values = {str(name): _value(node, name, f"{key}.{name}", trust, parts) for name in node}
     constructor = resolve(str(values.pop("_target_")), f"{key}._target_", trust)
     values = _checked(constructor, values, key, extra, parts)
+    if missing := ", ".join(sorted(getattr(constructor, "__abstractmethods__", ()))):
+        raise ConfigError(f"{key}: {constructor.__qualname__} lacks {missing}")
     try:
         return constructor(**values, **extra)
-    except (ValueError, TypeError, AttributeError, NotImplementedError) as error:
+    except PirlError as error:
         message = str(error)
         raise ConfigError(message if message.startswith(f"{key}.") else f"{key}: {message}") from error
 
@@ -85,11 +87,14 @@ def resolve(target: str, key: str, trust: Sequence[str] = ()) -> Any:
             f"{key}: {target} is outside pirl_rl and may run any code; if you trust it, name its module: "
             f"trust=[{target.rpartition('.')[0] or target}]"
         )
+    module, _, name = target.rpartition(".")
+    if not module:
+        raise ConfigError(f"{key}: expected a class as module.Name, got {target}")
     try:
-        module, _, name = target.rpartition(".")
+        # Any other error while a module is imported is a bug in it.
         found = getattr(importlib.import_module(module), name)
-    except Exception as error:
-        raise ConfigError(f"{key}: cannot load {target}: {type(error).__name__}: {error}") from None
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(f"{key}: cannot load {target}: {type(error).__name__}: {error}") from error
     # A module also holds what it imports: pirl_rl.checkpoint.Path is not ours.
     home = getattr(found, "__module__", None) or ""
     if not ((inspect.isclass(found) and _within(home, ("pirl_rl",))) or (callable(found) and _within(home, trust))):
@@ -158,26 +163,51 @@ def convert(value: Any, expected: Any, key: str) -> Any:
         raise ConfigError(f"{key}: expected {name}, got {value!r} ({reason})") from None
 
 
-def load_config(folder: Path) -> DictConfig:
-    """The configuration of a run directory.
+def load_config(folder: str | Path) -> DictConfig:
+    """The configuration of a run directory, in the present format.
 
     It may refer to its own keys, `${env.dt}`, but call no resolver: `${oc.env:TOKEN}` would read what is not its own.
 
     Raises:
-        ConfigError: the folder is not a run directory, or its configuration calls resolvers.
+        ConfigError: the folder is not a run directory, its configuration calls resolvers, or is of a later format.
     """
-    path = folder / CONFIG
+    path = RunDirectory(folder).config
     if not path.is_file():
         raise ConfigError(f"{folder} is not a run directory: expected {path}")
     try:
         config = OmegaConf.load(path)
+        if not isinstance(config, DictConfig):
+            raise ConfigError(f"{path}: expected a mapping")
+        raw = OmegaConf.to_container(config, resolve=False)
+        _refuse_resolvers(raw, str(path))
+        written_in = config.pop("format", 1)
+        if written_in == 1:
+            config = _upgraded(config, raw)
+        elif written_in != FORMAT:
+            raise ConfigError(f"{path}: expected format 1 to {FORMAT}, got {written_in}; a later version wrote it")
     except (yaml.YAMLError, UnicodeDecodeError, OmegaConfBaseException, OSError) as error:
         raise ConfigError(f"{path} is not readable: {str(error).partition(chr(10))[0]}") from None
-    if not isinstance(config, DictConfig):
-        raise ConfigError(f"{path}: expected a mapping")
-    _refuse_resolvers(OmegaConf.to_container(config, resolve=False), str(path))
     OmegaConf.set_struct(config, True)
     return config
+
+
+def _upgraded(config: DictConfig, raw: Any) -> DictConfig:
+    """A configuration of format 1 in the present one; where it referred to a key that stands yet, it still does."""
+    new = OmegaConf.create(upgraded(OmegaConf.to_container(config, resolve=True)))  # type: ignore[arg-type]
+    for key, reference in _references(raw):
+        values = [OmegaConf.select(new, name) for name in (key, reference[2:-1])]
+        if values[0] is not None and values[0] == values[1]:
+            OmegaConf.update(new, key, reference)
+    return new
+
+
+def _references(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
+    """All (key, "${other.key}") of nested mappings."""
+    for name, inner in value.items():
+        if isinstance(inner, dict):
+            yield from _references(inner, f"{key}{name}.")
+        elif isinstance(inner, str) and REFERENCE.fullmatch(inner):
+            yield f"{key}{name}", inner
 
 
 def _refuse_resolvers(value: Any, key: str) -> None:
@@ -188,7 +218,7 @@ def _refuse_resolvers(value: Any, key: str) -> None:
         raise ConfigError(f"{key}: a run directory may refer to its own keys only, got {value}; write the value itself")
 
 
-def save_config(config: DictConfig, folder: Path) -> None:
+def save_config(config: DictConfig, folder: str | Path) -> None:
     """Write what `load_config` reads."""
-    with replacing(folder / CONFIG) as file:
-        file.write(OmegaConf.to_yaml(config))
+    with replacing(RunDirectory(folder).config) as file:
+        file.write(f"format: {FORMAT}\n{OmegaConf.to_yaml(config)}")

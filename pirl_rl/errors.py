@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+INTERRUPTED = 130
+"""Exit code of a command that was interrupted and can go on, as shells have it: 128 and the number of SIGINT."""
+
 
 class PirlError(Exception):
     """Base of every error that this package raises on purpose."""

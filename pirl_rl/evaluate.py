@@ -1,6 +1,23 @@
-"""`python -m pirl_rl.evaluate`: see `pirl_rl.commands.evaluate`."""
+"""`python -m pirl_rl.evaluate`, see `pirl_rl.commands.evaluate`; `pirl_rl.evaluate(...)`, see `pirl_rl.api.evaluate`.
+
+The command and the function have one name, so that this module is both: called, it is the function.
+"""
+
+import sys
+from types import ModuleType
 
 from pirl_rl.commands.evaluate import main
+
+
+class _Evaluate(ModuleType):
+    def __call__(self, run, *, trust=(), **settings):
+        """Evaluate a run again and return its metrics: see `pirl_rl.api.evaluate`."""
+        from pirl_rl import api
+
+        return api.evaluate(run, trust=trust, **settings)
+
+
+sys.modules[__name__].__class__ = _Evaluate
 
 if __name__ == "__main__":
     main()

@@ -10,11 +10,9 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
-from torchrl.record.loggers import get_logger
 
 from pirl_rl.files import replacing
-
-METRICS_FILE = "metrics.csv"
+from pirl_rl.run_directory import RunDirectory
 
 
 class MetricsLogger(Protocol):
@@ -35,7 +33,7 @@ class CSVLogger:
     """One row an update in `metrics.csv`; its columns are those of the first row, cells may stay empty."""
 
     def open(self, folder: Path, config: Mapping[str, Any]) -> None:
-        self.path = folder / METRICS_FILE
+        self.path = RunDirectory(folder).metrics
         self.columns = self._read()[0]
 
     def log(self, row: Mapping[str, float]) -> None:
@@ -81,6 +79,9 @@ class TorchRLLogger(CSVLogger):
         self.project = project
 
     def open(self, folder: Path, config: Mapping[str, Any]) -> None:
+        # Only here: TorchRL's loggers bring their libraries with them, among them W&B's.
+        from torchrl.record.loggers import get_logger
+
         super().open(folder, config)
         name, extra = str(self.kind), dict[str, Any]()
         if self.kind == "wandb":

@@ -58,8 +58,8 @@ class PIRLLoss(ScheduledTD3Loss):
         td_weight, hjb_weight, boundary_weight: initial weights of the three terms.
 
     Raises:
-        ArgumentError: an argument out of range, or critics with which the actor rule cannot work.
-        TypeError: a critic with an activation that is not C^2.
+        ArgumentError: an argument out of range, critics with which the actor rule cannot work, or a critic whose
+            activation is not C^2.
     """
 
     td_weight: Tensor

@@ -13,6 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sets import Box
 
@@ -79,9 +80,21 @@ def _stack(
     layers.append(Scaling(low, high))
     width = len(low)
     for wide in hidden:
-        layers += [Dense(width, wide), getattr(nn, activation)()]
+        layers += [Dense(width, wide), _activation("activation", activation)]
         width = wide
-    return nn.Sequential(*layers, Dense(width, outputs), *([] if output is None else [getattr(nn, output)()]))
+    return nn.Sequential(*layers, Dense(width, outputs), *([] if output is None else [_activation("output", output)]))
+
+
+def _activation(argument: str, name: str) -> nn.Module:
+    """The layer of `torch.nn` of that name, without arguments.
+
+    Raises:
+        ArgumentError: there is none.
+    """
+    layer = getattr(nn, name, None)
+    if not (isinstance(layer, type) and issubclass(layer, nn.Module)):
+        raise ArgumentError(f"{argument}: expected the name of a layer of torch.nn, got {name!r}")
+    return layer()
 
 
 def _xavier(layers: nn.Sequential) -> None:

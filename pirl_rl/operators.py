@@ -21,6 +21,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from pirl_rl.errors import ArgumentError
 from pirl_rl.networks import CriticValue, Dense, RootTime, Scaling
 from pirl_rl.problem import ReachAvoidProblem
 
@@ -127,12 +128,12 @@ def require_twice_differentiable(layers: nn.Sequential) -> None:
     """Refuse a network whose second derivatives do not exist or are not known to the fast path.
 
     Raises:
-        TypeError: naming the layer and the activations that can stand in its place.
+        ArgumentError: naming the layer and the activations that can stand in its place.
     """
     for layer in layers:
         if not isinstance(layer, (RootTime, Scaling, Dense)) and type(layer) not in ACTIVATIONS:
             known = ", ".join(sorted(kind.__name__ for kind in ACTIVATIONS))
-            raise TypeError(
+            raise ArgumentError(
                 f"critic: the HJB residual takes second derivatives, so every activation must be C^2; "
                 f"expected one of {known}, got {type(layer).__name__}"
             )

@@ -58,7 +58,7 @@ class ReachAvoidProblem(ABC):
     def target_constraints(self, x: Tensor) -> Tensor:
         """(*, n) -> (*, k): smooth levels whose intersection is A, for sets with corners."""
         if type(self).target_level is ReachAvoidProblem.target_level:
-            raise NotImplementedError(f"{type(self).__name__} needs target_level(x): <= 0 inside the target")
+            raise ProblemError(f"{type(self).__name__} needs target_level(x): <= 0 inside the target")
         return self.target_level(x).unsqueeze(-1)
 
     def avoid_level(self, x: Tensor) -> Tensor:

@@ -1,6 +1,23 @@
-"""`python -m pirl_rl.train`: see `pirl_rl.commands.train`."""
+"""`python -m pirl_rl.train`, see `pirl_rl.commands.train`; `pirl_rl.train(...)`, see `pirl_rl.api.train`.
+
+The command and the function have one name, so that this module is both: called, it is the function.
+"""
+
+import sys
+from types import ModuleType
 
 from pirl_rl.commands.train import main
+
+
+class _Train(ModuleType):
+    def __call__(self, problem_or_experiment, *, folder=None, **settings):
+        """Train a problem or an experiment and return its `Run`: see `pirl_rl.api.train`."""
+        from pirl_rl import api
+
+        return api.train(problem_or_experiment, folder=folder, **settings)
+
+
+sys.modules[__name__].__class__ = _Train
 
 if __name__ == "__main__":
     main()

@@ -23,6 +23,7 @@ from pirl_rl.guard import Rollback
 from pirl_rl.learner import Learner
 from pirl_rl.loggers import MetricsLogger, NoLogger
 from pirl_rl.progress import Progress, interruptible
+from pirl_rl.run_directory import RunDirectory
 from pirl_rl.sampling.boundary import BoundarySampler
 from pirl_rl.sampling.collocation import Collocation
 from pirl_rl.schedules import WEIGHTS, Schedule
@@ -239,7 +240,7 @@ class Trainer:
             **metrics_of(self.evidence),
         }
         if self.folder is not None:
-            with replacing(self.folder / "summary.json") as file:
+            with replacing(RunDirectory(self.folder).summary) as file:
                 file.write(json.dumps(summary, indent=2) + "\n")
         return summary
 
@@ -252,11 +253,11 @@ class Trainer:
         self.learner.check_parameters(self.update)
         if self.folder is None:
             return
-        folder = self.folder / checkpoint.FOLDER
-        checkpoint.save(self.state_dict(), folder / checkpoint.LAST)
+        run = RunDirectory(self.folder)
+        checkpoint.save(self.state_dict(), run.last)
         if keep_weights:
             weights = {"loss": self.learner.loss.state_dict(), "update": self.update}
-            checkpoint.save(weights, checkpoint.weights_path(folder, self.update))
+            checkpoint.save(weights, run.weights(self.update))
         self.saved = self.update
 
     def state_dict(self) -> dict[str, Any]:

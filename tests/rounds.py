@@ -14,7 +14,7 @@ import numpy as np
 from pirl_rl.outer_loop.advisors import Request
 from pirl_rl.outer_loop.advisors.greedy import Greedy
 from pirl_rl.outer_loop.history import History, Result, Round
-from pirl_rl.outer_loop.loop import Loop, Settings
+from pirl_rl.outer_loop.loop import Loop, LoopSettings
 from pirl_rl.outer_loop.parsing import parse_plan
 from pirl_rl.outer_loop.plan import Candidate, Plan
 from pirl_rl.outer_loop.processes import Job
@@ -200,7 +200,7 @@ def greedy(request) -> str:
 def make_loop(out: Path, advisor=None, launcher=None, **settings) -> Loop:
     out.mkdir(exist_ok=True)
     given = {"rounds": 2, "candidates": 2, "updates": 100, "extra_rounds": 0, "start": Path("/some where/last.pt")}
-    return Loop(Settings(**given | settings), Record(out), advisor or Greedy(), launcher or FakeTrain())
+    return Loop(LoopSettings(**given | settings), Record(out), advisor or Greedy(), launcher or FakeTrain())
 
 
 def run(loop: Loop):

@@ -13,14 +13,14 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from rounds import BASE, QUIET, candidate, write_json
 from small import small_trainer
 
-from pirl_rl import checkpoint
-from pirl_rl.assembly import begin
+from pirl_rl.assembly import start_from
+from pirl_rl.commands.baseline import measure
 from pirl_rl.configuration import CONF
 from pirl_rl.errors import ConfigError
 from pirl_rl.outer_loop.candidates import Task, job, overrides, quoted, result, settle
 from pirl_rl.outer_loop.history import Result
 from pirl_rl.outer_loop.plan import Candidate
-from pirl_rl.outer_loop.start import measure
+from pirl_rl.run_directory import RunDirectory
 from pirl_rl.schedules import LossSchedule
 
 
@@ -124,13 +124,13 @@ def test_weights_of_the_start_are_those_of_its_last_update(tmp_path):
     trainer.train()
     collocation = "collocation._target_=pirl_rl.sampling.collocation.ReplayCollocation"
     candidates = small_trainer(tmp_path / "next", collocation, "evaluation.final=[success,calibration]")
-    path = begin(candidates, str(tmp_path / "before"))
+    path = start_from(candidates, str(tmp_path / "before"))
     begun = measure(candidates, path)
     assert begun.weights == pytest.approx((1, 0.8, 2.6))
     assert (begun.collocation_jitter, begun.collocation_replay_share) == (pytest.approx(0.18), pytest.approx(0.6))
     assert {"reward", "calibration_mae", "success_low"} <= begun.metrics.keys()
-    early = begin(candidates, str(checkpoint.weights_path(path.parent, 5)))
+    early = start_from(candidates, str(RunDirectory.of_checkpoint(path).weights(5)))
     assert measure(candidates, early).weights == trainer.curriculum.weights(4)
     plain = small_trainer(tmp_path / "plain", "evaluation.final=[success,calibration]")
-    begun = measure(plain, begin(plain, str(path)))
+    begun = measure(plain, start_from(plain, str(path)))
     assert (begun.collocation_jitter, begun.collocation_replay_share) == (None, None)

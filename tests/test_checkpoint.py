@@ -15,8 +15,9 @@ import torch
 from small import resumed, small_trainer
 
 from pirl_rl import load_run
-from pirl_rl.checkpoint import LAST, load, restore_rng, save
+from pirl_rl.checkpoint import load, restore_rng, save
 from pirl_rl.errors import CheckpointError
+from pirl_rl.run_directory import RunDirectory
 
 STATE = {"loss": {"weight": torch.arange(1000.0)}, "update": 3, "rng": torch.get_rng_state(), "names": ("a", 1, None)}
 
@@ -40,26 +41,26 @@ class Payload:
 
 
 def test_round_trip(tmp_path):
-    save(STATE, tmp_path / "a" / LAST)
-    back = load(tmp_path / "a" / LAST)
+    save(STATE, tmp_path / "a" / RunDirectory.LAST.name)
+    back = load(tmp_path / "a" / RunDirectory.LAST.name)
     assert torch.equal(back["loss"]["weight"], STATE["loss"]["weight"])
     assert back["names"] == STATE["names"]
-    assert [path.name for path in (tmp_path / "a").iterdir()] == [LAST]
+    assert [path.name for path in (tmp_path / "a").iterdir()] == [RunDirectory.LAST.name]
 
 
 @pytest.mark.parametrize("form", ["pickle", "torch"])
 def test_hostile_pickle_runs_nothing(form, tmp_path):
-    path, proof = tmp_path / LAST, tmp_path / "ran"
+    path, proof = tmp_path / RunDirectory.LAST.name, tmp_path / "ran"
     hostile = {"loss": Payload(proof), "update": 1}
     path.write_bytes(pickle.dumps(hostile)) if form == "pickle" else torch.save(hostile, path)
-    with pytest.raises(CheckpointError, match=LAST):
+    with pytest.raises(CheckpointError, match=RunDirectory.LAST.name):
         load(path)
     assert not proof.exists()
 
 
 def test_broken_files_are_told_as_such(tmp_path):
-    save(STATE, tmp_path / LAST)
-    good = (tmp_path / LAST).read_bytes()
+    save(STATE, tmp_path / RunDirectory.LAST.name)
+    good = (tmp_path / RunDirectory.LAST.name).read_bytes()
     broken = tmp_path / "broken.pt"
     cuts = [0, 1, 100, len(good) // 2, len(good) - 1]
     for content in [*(good[:cut] for cut in cuts), b"\0" * 500, b"\x80\x02}q\x00."]:
@@ -74,20 +75,20 @@ def test_broken_files_are_told_as_such(tmp_path):
 
 
 def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
-    path = tmp_path / LAST
+    path = tmp_path / RunDirectory.LAST.name
     save(STATE, path)
     before = path.read_bytes()
     with pytest.raises(AttributeError, match="pickle"):
         save({"half": torch.ones(1000), "rest": lambda: None}, path)
     assert path.read_bytes() == before
-    assert [entry.name for entry in tmp_path.iterdir()] == [LAST]
+    assert [entry.name for entry in tmp_path.iterdir()] == [RunDirectory.LAST.name]
 
 
 def test_a_link_under_the_drafts_name_is_not_followed(tmp_path):
     precious = tmp_path / "precious"
     precious.write_text("mine")
-    (tmp_path / f".{LAST}.draft").symlink_to(precious)
-    save(STATE, tmp_path / LAST)
+    (tmp_path / f".{RunDirectory.LAST.name}.draft").symlink_to(precious)
+    save(STATE, tmp_path / RunDirectory.LAST.name)
     assert precious.read_text() == "mine"
 
 
@@ -103,7 +104,7 @@ def test_generators_go_on_and_another_device_s_begins_anew():
 
 
 def test_every_checkpoint_of_a_killed_writer_loads(tmp_path):
-    path = tmp_path / LAST
+    path = tmp_path / RunDirectory.LAST.name
     save({"loss": {"weight": torch.zeros(1)}, "update": -1}, path)
     rng = random.Random(0)
     for _ in range(3):
@@ -150,7 +151,7 @@ def test_killed_training_at_twenty_random_moments(tmp_path):
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
-        while load(folder / "checkpoints" / LAST)["update"] == reached:
+        while load(folder / RunDirectory.LAST)["update"] == reached:
             assert child.poll() is None, "training ended by itself"
             time.sleep(0.02)
         time.sleep(rng.uniform(0, 1))
@@ -158,5 +159,5 @@ def test_killed_training_at_twenty_random_moments(tmp_path):
         child.wait()
         for path in (folder / "checkpoints").glob("*.pt"):
             load(path)
-        reached = load(folder / "checkpoints" / LAST)["update"]
+        reached = load(folder / RunDirectory.LAST)["update"]
     assert resumed(folder, "trainer.updates=1000000").update == reached >= 40

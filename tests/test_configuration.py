@@ -10,9 +10,10 @@ from omegaconf import OmegaConf
 from small import small_config, small_trainer
 
 from pirl_rl import load_run
-from pirl_rl.configuration import CONFIG, build, load_config, resolve
+from pirl_rl.configuration import build, load_config, resolve
 from pirl_rl.errors import ConfigError
 from pirl_rl.problems import Reach1D
+from pirl_rl.run_directory import RunDirectory
 
 MODULE = """
 import os
@@ -108,7 +109,7 @@ def run(tmp_path_factory):
 @pytest.fixture
 def edited(run):
     """Rewrites a setting of the run's configuration, for one test."""
-    path = run / CONFIG
+    path = RunDirectory(run).config
     before = path.read_text()
 
     def edit(key: str, value) -> Path:
@@ -146,7 +147,7 @@ def test_a_run_directory_cannot_trust_for_the_user(edited, my_module):
 
 @pytest.mark.parametrize("text", ["[", "- 1", "\x00", "a: ${"])
 def test_unreadable_configurations(text, tmp_path):
-    (tmp_path / CONFIG).parent.mkdir()
-    (tmp_path / CONFIG).write_text(text)
+    RunDirectory(tmp_path).config.parent.mkdir()
+    RunDirectory(tmp_path).config.write_text(text)
     with pytest.raises(ConfigError, match=r"config\.yaml"):
         load_config(tmp_path)

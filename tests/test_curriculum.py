@@ -13,6 +13,7 @@ from pirl_rl.actor_rules import ClippedSurrogate, Hamiltonian, LookAhead
 from pirl_rl.curriculum import Curriculum, Stage
 from pirl_rl.errors import ConfigError, Interrupted
 from pirl_rl.loggers import read_metrics
+from pirl_rl.run_directory import RunDirectory
 from pirl_rl.schedules import ConstantSchedule, LinearSchedule, LossSchedule
 
 WHOLE = LossSchedule([1, 0, 0], [0, 1, 1], center=50, steepness=0.1)
@@ -109,7 +110,7 @@ def test_resume_inside_a_stage_is_exact(stages, stop, end, tmp_path):
     with pytest.raises(Interrupted):
         stopped.train()
     resumed(tmp_path / "cut", *stages).train()
-    ends = [checkpoint.load(tmp_path / name / checkpoint.FOLDER / checkpoint.LAST) for name in ("whole", "cut")]
+    ends = [checkpoint.load(tmp_path / name / RunDirectory.LAST) for name in ("whole", "cut")]
     assert ends[0]["update"] == end
     assert_same(*ends)
 

@@ -11,10 +11,11 @@ import pytest
 import torch
 from small import assert_same, at_update, interrupt, resumed, small_trainer
 
-from pirl_rl.assembly import begin
-from pirl_rl.checkpoint import LAST, load
+from pirl_rl.assembly import start_from
+from pirl_rl.checkpoint import load
 from pirl_rl.errors import CollapseError, Interrupted
 from pirl_rl.guard import Guard
+from pirl_rl.run_directory import RunDirectory
 from pirl_rl.trainer import Trainer
 
 GUARDED = (
@@ -105,7 +106,7 @@ def test_nan_is_a_collapse(name):
 
 
 def last(folder) -> dict:
-    return load(folder / "checkpoints" / LAST)
+    return load(folder / RunDirectory.LAST)
 
 
 @pytest.fixture(scope="module")
@@ -163,7 +164,7 @@ def test_a_collapse_ends_with_the_last_good_networks(harm, tmp_path, capfd):
 def test_physics_without_a_boundary_flatten_the_value(sound, tmp_path, capfd):
     """Any constant solves L V = 0: with the other terms gone V forgets the target, whatever the policy does."""
     trainer = small_trainer(tmp_path, *GUARDED, "schedule.final=[0,1,0]", "trainer.updates=400")
-    begin(trainer, str(sound[0]))
+    start_from(trainer, str(sound[0]))
     before = networks(trainer)
     summary = trainer.train()
     assert summary["rolled_back_to"] < summary["collapsed_at"] < 400

@@ -521,7 +521,7 @@ def test_clipped_surrogate_needs_the_noise_that_is_played():
 
 def test_a_relu_critic_is_refused_by_name():
     problem = Reach1D()
-    with pytest.raises(TypeError, match="got ReLU"):
+    with pytest.raises(ArgumentError, match="got ReLU"):
         PIRLLoss(problem, Actor(problem), [Critic(problem, (4,), "ReLU")], Hamiltonian(problem))
 
 

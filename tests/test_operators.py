@@ -11,6 +11,7 @@ import torch
 from oracles import PROBLEMS, FullNoise, name, nested_generator, points
 from torch import nn
 
+from pirl_rl.errors import ArgumentError
 from pirl_rl.networks import Critic, stack
 from pirl_rl.operators import ACTIVATIONS, advection, generator, require_twice_differentiable
 from pirl_rl.problems import Reach1D
@@ -193,7 +194,7 @@ def test_a_control_that_is_not_optimal_has_a_negative_residual():
 
 
 def test_a_network_without_second_derivatives_is_refused_by_name():
-    with pytest.raises(TypeError, match=r"expected one of .*Tanh.*, got ReLU"):
+    with pytest.raises(ArgumentError, match=r"expected one of .*Tanh.*, got ReLU"):
         require_twice_differentiable(Critic(Reach1D(), (4,), "ReLU").layers)
     for kind in ACTIVATIONS:
         require_twice_differentiable(Critic(Reach1D(), (4,), kind.__name__).layers)

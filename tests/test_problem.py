@@ -195,7 +195,7 @@ def test_a_wrong_part_is_named(problem, message):
 
 
 def test_a_missing_target_is_named():
-    with pytest.raises(NotImplementedError, match=r"NoTarget needs target_level\(x\)"):
+    with pytest.raises(ProblemError, match=r"NoTarget needs target_level\(x\)"):
         check_problem(NoTarget())
 
 

@@ -10,11 +10,12 @@ from small import QUICK, assert_same, at_update, interrupt, resumed, small_train
 from test_checkpoint import Payload
 
 from pirl_rl import checkpoint, train
-from pirl_rl.assembly import begin
-from pirl_rl.checkpoint import LAST, load
+from pirl_rl.assembly import start_from
+from pirl_rl.checkpoint import load
 from pirl_rl.collectors.transitions import TRANSITION
 from pirl_rl.configuration import load_config
 from pirl_rl.errors import CheckpointError, Interrupted
+from pirl_rl.run_directory import RunDirectory
 from pirl_rl.trainer import Trainer
 
 NOISELESS = ("collector.exploration_noise=0", "collector.exploration=always")
@@ -25,12 +26,12 @@ def first(tmp_path_factory):
     """A run of 20 updates with weights kept at the fifth, and what its end left."""
     folder = tmp_path_factory.mktemp("first")
     small_trainer(folder, *NOISELESS).train()
-    return folder, load(folder / "checkpoints" / LAST)
+    return folder, load(folder / RunDirectory.LAST)
 
 
 def begun(folder, start, *overrides: str) -> Trainer:
     trainer = small_trainer(folder, *NOISELESS, *overrides)
-    begin(trainer, str(start))
+    start_from(trainer, str(start))
     return trainer
 
 
@@ -132,7 +133,7 @@ def test_workers_play_the_actor_in_the_warm_up(first, tmp_path):
 
 def test_a_collapsed_runs_transitions_stay_behind(first, tmp_path):
     collapsed = {**first[1], "rollback": {"collapsed_at": 18}}
-    checkpoint.save(collapsed, tmp_path / "run" / "checkpoints" / LAST)
+    checkpoint.save(collapsed, tmp_path / "run" / RunDirectory.LAST)
     trainer = begun(tmp_path / "new", tmp_path / "run")
     assert_same(trainer.learner.state_dict(), first[1]["learner"])
     trainer.collector.start()
@@ -140,7 +141,7 @@ def test_a_collapsed_runs_transitions_stay_behind(first, tmp_path):
     assert played_by_the_actor(trainer, 0)
 
 
-@pytest.mark.parametrize("kind", [LAST, "weights-000000005.pt"])
+@pytest.mark.parametrize("kind", [RunDirectory.LAST.name, "weights-000000005.pt"])
 def test_such_a_run_resumes_bit_for_bit_without_its_start(kind, first, tmp_path):
     source = tmp_path / "source.pt"
     source.write_bytes((first[0] / "checkpoints" / kind).read_bytes())
@@ -153,7 +154,7 @@ def test_such_a_run_resumes_bit_for_bit_without_its_start(kind, first, tmp_path)
     with pytest.raises(Interrupted):
         cut.train()
     resumed(tmp_path / "cut", *NOISELESS, *short).train()
-    ends = [load(tmp_path / name / "checkpoints" / LAST) for name in ("cut", "whole")]
+    ends = [load(tmp_path / name / RunDirectory.LAST) for name in ("cut", "whole")]
     assert_same(*ends)
     rows = [(tmp_path / name / "metrics.csv").read_bytes() for name in ("cut", "whole")]
     assert rows[0] == rows[1]
@@ -164,9 +165,9 @@ def test_transitions_of_another_environment_are_refused(first, tmp_path):
     other = {**parts, "state": parts["state"].repeat(1, 2)}
     left = first[1]["collector"]
     foreign = {**first[1], "collector": {**left, "buffer": {**left["buffer"], "transitions": other}}}
-    checkpoint.save(foreign, tmp_path / LAST)
+    checkpoint.save(foreign, tmp_path / RunDirectory.LAST.name)
     with pytest.raises(CheckpointError, match=r"does not fit.*state: expected shape \(1,\), got \(2,\)"):
-        begun(tmp_path / "new", tmp_path / LAST)
+        begun(tmp_path / "new", tmp_path / RunDirectory.LAST.name)
 
 
 # The command
@@ -182,7 +183,7 @@ def test_a_checkpoint_that_lacks_an_entry_says_which(part, key, first, tmp_path)
     _folder, left = first
     state = copy.deepcopy(left)
     del (state["learner"] if part == "learner" else state["collector"]["buffer"]["transitions"])[key]
-    checkpoint.save(state, path := tmp_path / "older" / LAST)
+    checkpoint.save(state, path := tmp_path / "older" / RunDirectory.LAST.name)
     with pytest.raises(CheckpointError, match=f"does not fit.*no entry .*{key}.*weights-"):
         begun(tmp_path / "new", path)
 
@@ -193,7 +194,7 @@ def test_the_command_starts_from_a_run(first, cli, tmp_path):
     code, text = cli(*QUICK, "trainer.updates=3", "start=link", "env.num_envs=64", "collector.frames_per_batch=128")
     assert code == 0, text
     [run] = tmp_path.glob("runs/*/*")
-    assert load_config(run).start == str(tmp_path / "link" / "checkpoints" / LAST)
+    assert load_config(run).start == str(tmp_path / "link" / RunDirectory.LAST)
 
 
 @pytest.mark.parametrize(

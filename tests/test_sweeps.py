@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from small import QUICK, command
 
 from pirl_rl.errors import RunError
+from pirl_rl.run_directory import RunDirectory
 from pirl_rl.runs import sweeps
 
 CENTERS, STEEP = ("1e3", "2e3", "4000", "8e3", "16e3"), ("1e-4", "3e-4", "0.001", "3e-3", "1e-2")
@@ -23,7 +24,7 @@ def job(folder: Path, settings: dict[str, str], **summary: float) -> None:
     run = folder / str(len(list(folder.glob("*"))))
     (run / ".hydra").mkdir(parents=True)
     (run / ".hydra" / "config.yaml").write_text("experiment_name: e\nmethod_name: m\n")
-    OmegaConf.save(OmegaConf.create([f"{key}={value}" for key, value in settings.items()]), run / sweeps.OVERRIDES)
+    OmegaConf.save(OmegaConf.create([f"{key}={value}" for key, value in settings.items()]), RunDirectory(run).overrides)
     (run / "metrics.csv").write_text("update,td_loss\n1,1\n")
     if summary:
         (run / "summary.json").write_text(json.dumps(summary))
@@ -136,7 +137,7 @@ def test_no_runs_and_broken_ones_are_reported(tmp_path, capsys):
     assert not (tmp_path / "nothing").exists()
     for content in ("a: 1\n", "[", "\0"):
         job(tmp_path, {"a": "1"}, value_mse=1.0)
-        (tmp_path / "0" / sweeps.OVERRIDES).write_text(content)
+        RunDirectory(tmp_path / "0").overrides.write_text(content)
         with pytest.raises(RunError, match=r"overrides\.yaml"):
             sweeps.find_jobs(tmp_path)
 

@@ -14,8 +14,10 @@ import torch
 from omegaconf import OmegaConf
 from small import QUICK, command
 
-from pirl_rl import __main__, load_run, train
-from pirl_rl.configuration import CONF, CONFIG, load_config
+from pirl_rl import load_run, train
+from pirl_rl.commands import catalogue
+from pirl_rl.configuration import CONF, load_config
+from pirl_rl.run_directory import RunDirectory
 
 OWN = """
 import torch
@@ -206,7 +208,7 @@ def test_resume_writes_nowhere_else(finished, cli, tmp_path):
 
 
 def test_resume_ignores_what_the_directory_trusts(finished, cli):
-    path, before = finished / CONFIG, (finished / CONFIG).read_text()
+    path, before = RunDirectory(finished).config, RunDirectory(finished).config.read_text()
     hostile = OmegaConf.create(before)
     hostile.trust = ["os"]
     hostile.logger = {"_target_": "os.system", "command": "touch ran"}
@@ -219,11 +221,11 @@ def test_resume_ignores_what_the_directory_trusts(finished, cli):
 
 
 def test_a_run_is_never_overwritten(finished, cli):
-    before = (finished / CONFIG).read_bytes()
+    before = RunDirectory(finished).config.read_bytes()
     code, text = cli(*QUICK, "seed=5", f"hydra.run.dir={finished}")
     assert code == 1
     assert "never overwrites" in text
-    assert (finished / CONFIG).read_bytes() == before
+    assert RunDirectory(finished).config.read_bytes() == before
 
 
 def test_sweep_goes_on_after_a_bad_job(cli, tmp_path):
@@ -307,8 +309,8 @@ def test_installed_wheel_in_an_empty_directory(tmp_path):
 
 
 def test_catalogue_lists_what_there_is():
-    text = __main__.catalogue()
-    for group in __main__.GROUPS:
+    text = catalogue.catalogue()
+    for group in catalogue.GROUPS:
         for name in names(group):
             [line] = [line for line in text.splitlines() if line.split()[:1] == [name]]
             assert len(line.split()) > 2, f"conf/{group}/{name}.yaml needs a comment that says what it is"

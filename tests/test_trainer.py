@@ -9,12 +9,13 @@ import pytest
 import torch
 from small import assert_same, at_update, interrupt, resumed, small_trainer
 
-from pirl_rl.checkpoint import LAST, load
+from pirl_rl.checkpoint import load
 from pirl_rl.errors import CheckpointError, DivergenceError, Interrupted
+from pirl_rl.run_directory import RunDirectory
 
 
 def last(folder) -> dict:
-    return load(folder / "checkpoints" / LAST)
+    return load(folder / RunDirectory.LAST)
 
 
 def metrics(folder) -> bytes:
@@ -148,12 +149,12 @@ def scale_boundary(trainer, factor: float) -> None:
 def test_spoilt_networks_are_not_saved(tmp_path):
     trainer = small_trainer(tmp_path)
     trainer.save()
-    before = (tmp_path / "checkpoints" / LAST).read_bytes()
+    before = (tmp_path / RunDirectory.LAST).read_bytes()
     with torch.no_grad():
         next(trainer.learner.loss.actor_network_params.parameters()).fill_(math.nan)
     with pytest.raises(DivergenceError, match="actor"):
         trainer.save()
-    assert (tmp_path / "checkpoints" / LAST).read_bytes() == before
+    assert (tmp_path / RunDirectory.LAST).read_bytes() == before
 
 
 def test_progress_shows_figures_without_a_terminal(tmp_path, capfd):

@@ -10,7 +10,7 @@ import pytest
 from rounds import FakeTrain, answer, candidate
 from small import TUNED
 
-from pirl_rl import tune
+from pirl_rl.commands import tune
 from pirl_rl.configuration import load_config
 from pirl_rl.outer_loop.directory import LOCK, locked
 from pirl_rl.schedules import LossSchedule

@@ -60,7 +60,7 @@ def fill_buffer(
     """Put the transitions of another buffer's state into an empty one, oldest first; the newest where it is smaller.
 
     Raises:
-        ValueError: they are not those of such an environment.
+        ArgumentError: they are not those of such an environment.
     """
     if not state["transitions"]:
         return
@@ -68,6 +68,8 @@ def fill_buffer(
     example = env.fake_tensordict()
     example = example.set("loc", example["action"]).select(*TRANSITION)
     for key in TRANSITION:
+        if key not in transitions.keys(True):
+            raise ArgumentError(f"no entry {key} in the replay buffer; a file of checkpoints/weights-* may still do")
         got, expected = (entry[key].shape[1:] for entry in (transitions, example))
         if got != expected:
             raise ArgumentError(f"replay buffer, {key}: expected shape {tuple(expected)}, got {tuple(got)}")

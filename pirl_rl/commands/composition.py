@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import hydra
@@ -44,6 +45,7 @@ def arguments(target: str) -> dict[str, Any]:
     return {"_target_": target, **plain}
 
 
+@cache
 def register() -> None:
     """Make known to Hydra the constructors that `conf/` refers to."""
     store = ConfigStore.instance()
@@ -52,10 +54,23 @@ def register() -> None:
             store.store(target, arguments(target), group="arguments")
 
 
-def compose(name: str, overrides: Sequence[str]) -> DictConfig:
-    """A configuration from one of the primary files of `conf/`, "train" or "tune", and typed overrides."""
+def compose(name: str, overrides: Sequence[str], with_hydra: bool = False) -> DictConfig:
+    """A configuration from one of the primary files of `conf/`, "train" or "tune", and typed overrides.
+
+    A Hydra that is at work already, as around a command or a script of the user's, is back afterwards.
+
+    Args:
+        name: of the primary file.
+        overrides: `key=value`, as on a command line.
+        with_hydra: whether the configuration keeps Hydra's own settings, under `hydra`.
+    """
     register()
-    if GlobalHydra.instance().is_initialized():
-        return hydra.compose(name, list(overrides))
-    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        return hydra.compose(name, list(overrides))
+    active = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+            return hydra.compose(name, list(overrides), return_hydra_config=with_hydra)
+    finally:
+        GlobalHydra.instance().clear()
+        if active is not None:
+            GlobalHydra.instance().initialize(active)

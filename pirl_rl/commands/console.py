@@ -1,10 +1,13 @@
-"""What the commands share: overrides of a run's settings, the table of metrics, errors told in one line, warnings."""
+"""What the commands share: overrides of a run's settings, the table of metrics, and how errors are reported."""
 
 from __future__ import annotations
 
 import contextlib
+import site
 import sys
+import sysconfig
 import textwrap
+import traceback
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -14,28 +17,25 @@ from hydra.errors import CompactHydraException, HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from pirl_rl.errors import CheckpointError, CollectorError, ConfigError, DivergenceError, Interrupted, ProblemError
+from pirl_rl.configuration import PACKAGE
+from pirl_rl.errors import INTERRUPTED, ConfigError, Interrupted, PirlError
 
-EXPECTED = (
-    ConfigError,
-    CheckpointError,
-    CollectorError,
-    DivergenceError,
-    ProblemError,
-    HydraException,
-    OmegaConfBaseException,
-)
+EXPECTED = (PirlError, HydraException, OmegaConfBaseException)
 """Errors that are the user's to mend: their message is enough."""
 
-INTERRUPTED = 130
+LIBRARIES = tuple(
+    Path(path).resolve()
+    for path in (PACKAGE, sysconfig.get_path("stdlib"), sysconfig.get_path("purelib"), *site.getsitepackages())
+)
+"""Folders of code that is not the user's."""
 
 
 def quiet_libraries() -> None:
-    """What libraries warn of about each other, while they compile, no user can mend."""
+    """Silence what libraries warn of about each other while they compile, which no user can mend."""
     warnings.filterwarnings("ignore", category=FutureWarning, module=r"(torch|tensordict|torchrl)\b")
 
 
-def table(summary: Mapping[str, float], meanings: Mapping[str, str]) -> str:
+def metrics_table(summary: Mapping[str, float], meanings: Mapping[str, str]) -> str:
     """The numbers of a summary with the meanings of those that are metrics."""
     rows = []
     for name, value in summary.items():
@@ -51,7 +51,11 @@ def named_modules(overrides: Sequence[str]) -> list[str]:
 
 
 def override(config: DictConfig, text: str) -> None:
-    """Apply a typed `key=value` to a run's configuration."""
+    """Apply a typed `key=value` to a run's configuration.
+
+    Raises:
+        ConfigError: it is no such text, or sets more than a single value.
+    """
     try:
         parsed = OverridesParser.create().parse_override(text)
     except HydraException as error:
@@ -63,22 +67,48 @@ def override(config: DictConfig, text: str) -> None:
 
 
 @contextlib.contextmanager
-def told(folder: Path, one_of_many: bool = False) -> Iterator[None]:
-    """Expected errors end as one message and an exit code; in a sweep the other jobs still run."""
+def reported(folder: Path, one_of_many: bool = False) -> Iterator[None]:
+    """Turn errors into messages and an exit code; in a sweep the other jobs still run.
+
+    What is known to be a misfit is one line. Anything else is a bug, ours or in a class of the user's: its traceback is
+    printed, and a last line that says where in the user's code it happened.
+    """
     try:
         yield
     except Interrupted as stop:
         print(f"{stop}; go on with: python -m pirl_rl.train resume={folder}", file=sys.stderr)
         raise SystemExit(INTERRUPTED) from None
     except EXPECTED as error:
-        message = f"error: {_one_line(error)}"
-        print(message, file=sys.stderr, flush=True)
-        if one_of_many:
-            raise CompactHydraException(message) from None
-        raise SystemExit(1) from None
+        _end(f"error: {_one_line(error)}", one_of_many)
+    except Exception as error:
+        traceback.print_exc()
+        _end(f"error: {type(error).__name__}: {_first_line(str(error))}{_users_place(error)}", one_of_many)
+
+
+def _end(message: str, one_of_many: bool) -> None:
+    print(message, file=sys.stderr, flush=True)
+    if one_of_many:
+        raise CompactHydraException(message) from None
+    raise SystemExit(1) from None
 
 
 def _one_line(error: Exception) -> str:
     if isinstance(error, OmegaConfBaseException):
-        return f"{error.full_key}: {str(error.msg).partition(chr(10))[0]}"
+        return f"{error.full_key}: {_first_line(str(error.msg))}"
     return str(error)
+
+
+def _first_line(text: str) -> str:
+    return text.partition("\n")[0]
+
+
+def _users_place(error: Exception) -> str:
+    """ " (file, line)" of the innermost frame outside this package and the libraries; empty without one."""
+    places = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
+    if isinstance(error, SyntaxError) and error.filename:
+        places.append((error.filename, error.lineno))
+    for file, line in reversed(places):
+        path = Path(file).resolve()
+        if path.is_file() and not any(path.is_relative_to(folder) for folder in LIBRARIES):
+            return f" ({file}, line {line})"
+    return ""

@@ -12,23 +12,22 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pirl_rl.assembly import make_evaluation_simulator, make_evaluators
-from pirl_rl.commands.console import named_modules, override, table, told
+from pirl_rl.commands.console import metrics_table, named_modules, override, reported
 from pirl_rl.configuration import load_config
 from pirl_rl.errors import ConfigError
 from pirl_rl.evaluation import evaluate, meanings_of, metrics_of
-from pirl_rl.figures import FIGURES, draw_run
+from pirl_rl.figures import draw_run
 from pirl_rl.files import replacing
-from pirl_rl.loggers import METRICS_FILE
-from pirl_rl.runs.load import load_run, refuse_links
-
-RESULTS = "evaluation.json"
+from pirl_rl.run_directory import RunDirectory
+from pirl_rl.runs.load import load_run
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
     named = [item for item in arguments if item.startswith("run=")]
     folder = Path(named[-1].partition("=")[2]) if named else Path()
-    with told(folder):
+    run = RunDirectory(folder)
+    with reported(folder):
         if not named:
             raise ConfigError("run: expected run=RUN_DIR, the directory of a finished run")
         overrides = [item for item in arguments if item not in named]
@@ -39,13 +38,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         trust = [*config.trust, *named_modules(overrides)]
         evaluators = make_evaluators(config.evaluation, "final", trust)
         solution = load_run(folder, trust, device=config.device).solution
-        refuse_links(folder)
+        run.refuse_links()
         evidence = evaluate(solution, make_evaluation_simulator(config, solution.problem), evaluators)
         metrics = metrics_of(evidence)
-        with replacing(folder / RESULTS) as file:
+        with replacing(run.evaluation) as file:
             file.write(json.dumps(metrics, indent=2) + "\n")
-        figures = draw_run(solution, folder / METRICS_FILE, folder / FIGURES, evidence)
-    print(table(metrics, meanings_of(evaluators, solution.problem)))
+        figures = draw_run(solution, run.metrics, run.figures, evidence)
+    print(metrics_table(metrics, meanings_of(evaluators, solution.problem)))
     for figure in figures:
         print(f"figure   {figure}")
-    print(f"written  {folder / RESULTS}")
+    print(f"written  {run.evaluation}")

@@ -13,15 +13,12 @@ from pathlib import Path
 
 from pirl_rl import checkpoint
 from pirl_rl.checkpoint import TARGET
-from pirl_rl.commands.console import told
-from pirl_rl.commands.evaluate import RESULTS
+from pirl_rl.commands.console import reported
 from pirl_rl.configuration import load_config, save_config
 from pirl_rl.errors import ConfigError
-from pirl_rl.figures import FIGURES
-from pirl_rl.loggers import METRICS_FILE
-from pirl_rl.runs.load import refuse_links
+from pirl_rl.run_directory import RunDirectory
 
-COPIED = ("summary.json", RESULTS, METRICS_FILE, FIGURES)
+COPIED = (RunDirectory.SUMMARY, RunDirectory.EVALUATION, RunDirectory.METRICS, RunDirectory.FIGURES)
 
 
 def export(run: Path, out: Path) -> Path:
@@ -32,15 +29,16 @@ def export(run: Path, out: Path) -> Path:
         CheckpointError: no checkpoint, or a broken one.
     """
     config = load_config(run)
-    state = checkpoint.load(checkpoint.newest(run))
-    refuse_links(run)
+    source, copy = RunDirectory(run), RunDirectory(out)
+    state = checkpoint.load(source.newest())
+    source.refuse_links()
     if out.exists():
         raise ConfigError(f"out: {out} exists, and an export never overwrites anything")
     if "start" in config:
         config.start = None  # a path of this machine
     save_config(config, out)
     loss = {name: entry for name, entry in checkpoint.loss_state(state).items() if not name.startswith(TARGET)}
-    path = checkpoint.weights_path(out / checkpoint.FOLDER, state["update"])
+    path = copy.weights(state["update"])
     checkpoint.save({"loss": loss, "update": state["update"]}, path)
     for name in COPIED:
         if (run / name).is_dir():
@@ -53,7 +51,7 @@ def export(run: Path, out: Path) -> Path:
 def main(arguments: Sequence[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
     named = dict(item.split("=", 1) for item in arguments if "=" in item)
-    with told(Path(named.get("run", "."))):
+    with reported(Path(named.get("run", "."))):
         if set(named) != {"run", "out"} or len(named) != len(arguments):
             raise ConfigError(f"expected run=RUN_DIR out=FOLDER, got {' '.join(arguments) or 'nothing'}")
         path = export(Path(named["run"]), Path(named["out"]))

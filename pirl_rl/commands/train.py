@@ -15,17 +15,16 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from pirl_rl import checkpoint
-from pirl_rl.assembly import begin, make_trainer, restore
+from pirl_rl.assembly import make_trainer, restore, start_from
 from pirl_rl.commands.composition import register
-from pirl_rl.commands.console import INTERRUPTED, named_modules, override, quiet_libraries, table, told
+from pirl_rl.commands.console import metrics_table, named_modules, override, quiet_libraries, reported
 from pirl_rl.commands.methods import check_method
 from pirl_rl.configuration import CONF, load_config, save_config
-from pirl_rl.errors import ConfigError
+from pirl_rl.errors import INTERRUPTED, ConfigError
 from pirl_rl.evaluation import meanings_of
-from pirl_rl.figures import FIGURES, draw_run
-from pirl_rl.loggers import METRICS_FILE
-from pirl_rl.runs.load import refuse_links
+from pirl_rl.figures import draw_run
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.run_directory import RunDirectory
 from pirl_rl.trainer import Trainer
 
 
@@ -34,27 +33,50 @@ def train(config: DictConfig) -> float:
     """A new run in Hydra's run directory; returns the metric that a sweep may minimise."""
     hydra_config = HydraConfig.get()
     folder = Path(hydra_config.runtime.output_dir)
-    with told(folder, one_of_many=hydra_config.mode == RunMode.MULTIRUN), _new(folder):
+    with reported(folder, one_of_many=hydra_config.mode == RunMode.MULTIRUN):
+        summary = train_new(config, folder, hydra_config.overrides.task)
+    return summary.get("value_mse", summary.get("hjb_sup_loss", float("nan")))
+
+
+def train_new(
+    config: DictConfig,
+    folder: Path,
+    overrides: Sequence[str],
+    trust: Sequence[str] = (),
+    problem: ReachAvoidProblem | None = None,
+) -> dict[str, float]:
+    """Train from the first update on, into a run directory of its own; returns the summary.
+
+    Args:
+        config: all settings.
+        folder: the run directory, new or empty.
+        overrides: the settings that were typed, for the record; modules that they name are trusted.
+        trust: more modules outside the package that the configuration may name.
+        problem: what is trained on in place of `env.problem`.
+
+    Raises:
+        PirlError: settings that cannot be built, or a training that diverged or was interrupted.
+    """
+    with _new(folder):
         # What the user types is trusted; what a directory from elsewhere says is not.
-        check_method(config, hydra_config.overrides.task)
-        trust = [*config.trust, *named_modules(hydra_config.overrides.task)]
-        trainer = make_trainer(config, folder, trust)
+        check_method(config, overrides)
+        trust = [*config.trust, *named_modules(overrides), *trust]
+        trainer = make_trainer(config, folder, trust, problem)
         if config.start is not None:
             # On record as a file wherever one stands: what was typed may be relative, or a run that goes on.
             if not isinstance(config.start, str):
                 raise ConfigError(f"start: expected the path of a run or a checkpoint, got {config.start!r}")
-            config.start = str(begin(trainer, config.start))
+            config.start = str(start_from(trainer, config.start))
         save_config(config, folder)
-        OmegaConf.save(hydra_config.overrides.task, folder / ".hydra" / "overrides.yaml")
-        summary = _train(trainer)
-    return summary.get("value_mse", summary.get("hjb_sup_loss", float("nan")))
+        OmegaConf.save(overrides, RunDirectory(folder).overrides)
+        return _train(trainer)
 
 
 def resume(folder: Path, overrides: Sequence[str]) -> None:
     """Go on in a run directory, with plain `key=value` overrides of its configuration, which keeps them."""
-    with told(folder):
+    with reported(folder):
         config = load_config(folder)
-        refuse_links(folder)
+        RunDirectory(folder).refuse_links()
         config.trust = []
         for text in overrides:
             if text.startswith("start="):
@@ -68,24 +90,26 @@ def resume(folder: Path, overrides: Sequence[str]) -> None:
 
 def _train(trainer: Trainer) -> dict[str, float]:
     summary = trainer.train()
-    folder = trainer.folder
-    assert folder is not None
-    print(table(summary, meanings_of(trainer.final, trainer.solution.problem)))
-    for figure in draw_run(trainer.solution, folder / METRICS_FILE, folder / FIGURES, trainer.evidence):
+    assert trainer.folder is not None
+    run = RunDirectory(trainer.folder)
+    print(metrics_table(summary, meanings_of(trainer.final, trainer.solution.problem)))
+    for figure in draw_run(trainer.solution, run.metrics, run.figures, trainer.evidence):
         print(f"figure   {figure}")
-    print(f"run      {folder}")
+    print(f"run      {run}")
     return summary
 
 
 @contextlib.contextmanager
 def _new(folder: Path) -> Iterator[None]:
     """Nothing is overwritten, and a run that ends before its first row or checkpoint leaves nothing behind."""
+    folder.mkdir(parents=True, exist_ok=True)
     if any(folder.iterdir()):
         raise ConfigError(f"hydra.run.dir: {folder} is not empty, and a run never overwrites anything")
+    run = RunDirectory(folder)
     try:
         yield
     except BaseException:
-        if not (folder / METRICS_FILE).exists() and not (folder / checkpoint.FOLDER).exists():
+        if not run.metrics.exists() and not run.checkpoints.exists():
             shutil.rmtree(folder)
             for parent in (folder.parent, folder.parent.parent):
                 with contextlib.suppress(OSError):

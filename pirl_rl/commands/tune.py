@@ -19,39 +19,39 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
-from pirl_rl.assembly import begin, make_trainer
+from pirl_rl.assembly import make_trainer, start_from
+from pirl_rl.commands.baseline import measure
 from pirl_rl.commands.composition import compose, register
-from pirl_rl.commands.console import INTERRUPTED, named_modules, quiet_libraries, told
+from pirl_rl.commands.console import named_modules, quiet_libraries, reported
 from pirl_rl.configuration import CONF, build, convert
-from pirl_rl.errors import ConfigError
+from pirl_rl.errors import INTERRUPTED, ConfigError
 from pirl_rl.files import replacing
 from pirl_rl.outer_loop.candidates import LEADING, Task, overrides, quoted
 from pirl_rl.outer_loop.directory import KEPT, check, locked
-from pirl_rl.outer_loop.history import Result
-from pirl_rl.outer_loop.loop import Loop, Settings
+from pirl_rl.outer_loop.history import Result, tolerance
+from pirl_rl.outer_loop.loop import Loop, LoopSettings
 from pirl_rl.outer_loop.plan import START, Candidate
 from pirl_rl.outer_loop.processes import Processes
 from pirl_rl.outer_loop.record import Record
 from pirl_rl.outer_loop.redaction import redact
 from pirl_rl.outer_loop.report import markdown, write_report
-from pirl_rl.outer_loop.start import measure, tolerance
-from pirl_rl.runs.load import refuse_links
+from pirl_rl.run_directory import RunDirectory
 from pirl_rl.trainer import Trainer
 
 COUNTS = {"rounds": 1, "extra_rounds": 0, "candidates": 1, "updates": 1, "parallel": 1}
-"""The loop's numbers and the least of each."""
+"""Settings of the loop that are integers, with the least value of each."""
 
 OWN = ("start", "out", "advisor", *COUNTS)
 """Settings of the loop itself; all others are those of its candidates."""
 
 PLANNED = ("schedule", "stages", "resume", "trainer.updates", "evaluation.final")
-"""Settings that the loop gives to its candidates."""
+"""Settings that the loop itself gives to its candidates, and that nobody may type."""
 
 EVALUATIONS = 10
-"""Of a candidate, at least: the guard, which stops one that collapses, sees nothing between them."""
+"""Least number of evaluations during a candidate's training: between them the guard cannot see a collapse."""
 
 JUDGES = ("success", "residuals", "calibration")
-"""Evaluators of baseline and candidates."""
+"""Evaluators that judge the baseline and the candidates."""
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="tune")
@@ -59,7 +59,7 @@ def tune(config: DictConfig) -> None:
     """A loop in `out`, from its beginning or from where it was."""
     typed = HydraConfig.get().overrides.task
     out = Path(HydraConfig.get().runtime.output_dir)
-    with told(out), _tidy(out), _resumable(out):
+    with reported(out), _tidy(out), _resumable(out):
         counts = {name: _count(config, name) for name in COUNTS}
         train = [*_for_training(typed), *_often_enough(config)]
         trust = [*config.trust, *named_modules(typed)]
@@ -81,7 +81,7 @@ def tune(config: DictConfig) -> None:
                 record.write_baseline(baseline)
             del trainer  # its memory is the candidates'
             parallel = counts.pop("parallel")
-            settings = Settings(**counts, start=path, train=train, trust=trust, final=final, seed=config.seed)
+            settings = LoopSettings(**counts, start=path, train=train, trust=trust, final=final, seed=config.seed)
             loop = Loop(settings, record, advisor, Processes(parallel, [lock]))
             loop.run(record.history(baseline, tolerance(baseline)))
             _report(out, path)
@@ -89,8 +89,8 @@ def tune(config: DictConfig) -> None:
 
 def report(out: Path) -> None:
     """Draw what there is of a loop, finished or not."""
-    with told(out):
-        refuse_links(out)
+    with reported(out):
+        RunDirectory(out).refuse_links()
         if not (out / KEPT).is_file():
             raise ConfigError(f"out: {out} is no loop's directory, expected {KEPT} in it")
         settings = OmegaConf.to_container(OmegaConf.load(out / KEPT), resolve=False)
@@ -157,7 +157,7 @@ def _first(config: DictConfig, train: Sequence[str], trust: Sequence[str]) -> tu
         raise ConfigError(f"evaluation: expected success and calibration, to judge candidates by, got {final}")
     candidate = compose("train", [*LEADING, *train, *overrides(_example(config, Path(start)), final, config.seed)])
     trainer = make_trainer(candidate, None, trust)
-    return trainer, begin(trainer, start), final
+    return trainer, start_from(trainer, start), final
 
 
 def _example(config: DictConfig, start: Path) -> Task:
@@ -221,12 +221,12 @@ def main() -> None:
     if "--report" in arguments:
         named = [item.partition("=")[2] for item in arguments if item.startswith("out=")]
         named += [item for item in arguments if not item.startswith(("-", "out="))]
-        with told(Path()):
+        with reported(Path()):
             if len(named) != 1:
                 raise ConfigError("--report: expected out=DIR, the directory of one loop")
         report(Path(named[0]))
         return
-    with told(Path()):
+    with reported(Path()):
         if {"-m", "--multirun"} & {*arguments}:
             raise ConfigError("-m: a loop runs its candidates itself, expected candidates=... and parallel=... instead")
     register()

@@ -13,29 +13,29 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pirl_rl import checkpoint
-from pirl_rl.commands.console import INTERRUPTED
-from pirl_rl.errors import ConfigError
+from pirl_rl.errors import INTERRUPTED, ConfigError
 from pirl_rl.files import replacing
 from pirl_rl.outer_loop.history import Result
 from pirl_rl.outer_loop.plan import Candidate
 from pirl_rl.outer_loop.processes import Job
 from pirl_rl.outer_loop.redaction import redact
-from pirl_rl.runs.load import refuse_links
+from pirl_rl.run_directory import RunDirectory
 from pirl_rl.schedules import LossSchedule
 
-SUMMARY, FAILED = "summary.json", "failed.json"
+FAILED = "failed.json"
+"""Beside a run's own files: the exit code and the last lines of a candidate that ended with an error."""
+
 JUDGED = ("reward", "calibration_mae")
-"""What every result must have."""
+"""Metrics that every result must have."""
 
 TIMES = ("updates", "wall_seconds", "updates_per_second")
-"""Not of a summary's metrics: the same candidate run again has other ones."""
+"""Entries of a summary that are no metrics: they differ when the same candidate is trained again."""
 
 STOPPED = (INTERRUPTED, *(-number for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)))
-"""Exit codes of one that was asked to stop, and can go on."""
+"""Exit codes of a candidate that was asked to stop and can go on."""
 
 LEADING = ("trainer.rollback=true",)
-"""Settings of a candidate's training that the user's may change."""
+"""Settings of a candidate's training that stand before the user's own, which may change them."""
 
 LAST_LINES = 20
 
@@ -47,9 +47,9 @@ class Task:
     Attributes:
         name: "<round>/<candidate>".
         folder: its run directory; the log lies beside it, as a new run directory must be empty.
-        candidate: of the plan.
-        start: the result that it starts from, at `path`.
-        updates: its length.
+        candidate: its entry in the plan.
+        start: the result from which it goes on; its run or checkpoint lies at `path`.
+        updates: length of its training.
     """
 
     name: str
@@ -64,13 +64,24 @@ class Task:
         return self.folder.with_name(f"{self.folder.name}.log")
 
     @property
+    def run(self) -> RunDirectory:
+        return RunDirectory(self.folder)
+
+    @property
+    def failure(self) -> Path:
+        return self.folder / FAILED
+
+    @property
     def ended(self) -> bool:
-        return any((self.folder / name).is_file() for name in (SUMMARY, FAILED))
+        return self.run.summary.is_file() or self.failure.is_file()
 
     @property
     def schedule(self) -> LossSchedule:
+        """Of the candidate's training. A plan counts in updates, and a schedule takes a center up to 1 for a share."""
         one = self.candidate
-        return LossSchedule(one.schedule_initial, one.schedule_final, one.schedule_center, one.schedule_sharpness)
+        unit = self.updates if one.schedule_center <= 1 else 1
+        center, steepness = one.schedule_center / unit, one.schedule_sharpness * unit
+        return LossSchedule(one.schedule_initial, one.schedule_final, center, steepness)
 
     def moves(self) -> dict[str, tuple[float, float]]:
         """Start and end of what moves along the schedule, by its key in `collocation`; none where that has no such."""
@@ -91,8 +102,8 @@ def overrides(task: Task, final: Sequence[str], seed: int) -> list[str]:
         "schedule=sigmoid",
         f"schedule.initial={_list(one.schedule_initial)}",
         f"schedule.final={_list(one.schedule_final)}",
-        f"schedule.center={one.schedule_center!r}",
-        f"schedule.steepness={one.schedule_sharpness!r}",
+        f"schedule.center={task.schedule.center!r}",
+        f"schedule.steepness={task.schedule.steepness!r}",
         *(f"++collocation.{key}={_list(ends)}" for key, ends in task.moves().items()),
         "stages=[]",
         f"trainer.updates={task.updates}",
@@ -109,7 +120,7 @@ def job(task: Task, settings: Sequence[str], trust: Sequence[str]) -> Job:
         trust: modules outside the package; one that goes on names them again.
     """
     train = [sys.executable, "-m", "pirl_rl.train"]
-    if (task.folder / checkpoint.FOLDER / checkpoint.LAST).is_file():
+    if task.run.last.is_file():
         command = [*train, f"resume={task.folder}", f"trust=[{','.join(trust)}]"]
     else:
         _clear(task.folder)
@@ -125,7 +136,7 @@ def _clear(folder: Path) -> None:
     if folder.is_symlink():
         raise ConfigError(f"{folder}: expected a run directory, got a link")
     if folder.exists():
-        refuse_links(folder)
+        RunDirectory(folder).refuse_links()
         shutil.rmtree(folder)
 
 
@@ -139,24 +150,24 @@ def settle(task: Task, code: int) -> None:
     if (clean := redact(text)) != text:
         with replacing(task.log) as file:
             file.write(clean)
-    if (task.folder / SUMMARY).is_file():
+    if task.run.summary.is_file():
         return
     if code in STOPPED:
         raise KeyboardInterrupt(f"{task.name} was stopped")
     lines = [line for line in clean.splitlines() if line.strip()]
-    with replacing(task.folder / FAILED) as file:
+    with replacing(task.failure) as file:
         json.dump({"exit_code": code, "log": lines[-LAST_LINES:]}, file, indent=2)
 
 
 def result(task: Task) -> Result:
     """What became of a candidate that has ended."""
-    if not (task.folder / SUMMARY).is_file():
-        failure = json.loads((task.folder / FAILED).read_text(encoding="utf-8"))
+    if not task.run.summary.is_file():
+        failure = json.loads(task.failure.read_text(encoding="utf-8"))
         last = failure["log"][-1] if failure["log"] else "no word"
         # Later prompts quote it, and no path is to enter a prompt.
         reason = re.sub(r"\S*/\S*", "<path>", last)[:300]
         return _result(task, task.updates, status="failed", reason=f"exit code {failure['exit_code']}: {reason}")
-    summary = json.loads((task.folder / SUMMARY).read_text(encoding="utf-8"))
+    summary = json.loads(task.run.summary.read_text(encoding="utf-8"))
     metrics = {name: value for name, value in summary.items() if name not in TIMES and math.isfinite(value)}
     if missing := [name for name in JUDGED if name not in metrics]:
         reason = f"{', '.join(missing)}: expected a finite number, got {summary.get(missing[0])}"
@@ -172,8 +183,8 @@ def _result(task: Task, updates: int, checkpoint: str | None = None, **rest) -> 
     """With what is in force at the last of its updates."""
     weights, ends = task.start.weights, {key: before for key, (before, _) in task.moves().items()}
     if updates > 0:
-        progress = task.schedule.progress(updates - 1)
-        weights = task.schedule(updates - 1)
+        progress = task.schedule.progress(updates - 1, task.updates)
+        weights = task.schedule(updates - 1, task.updates)
         ends = {key: before + (after - before) * progress for key, (before, after) in task.moves().items()}
     return Result(
         checkpoint=checkpoint,

@@ -1,4 +1,4 @@
-"""Who may work in a loop's directory: one loop at a time, with the settings that it began with."""
+"""The directory of an outer loop: one loop works in it at a time, always with the settings of its first start."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from pathlib import Path
 from omegaconf import OmegaConf
 
 from pirl_rl.errors import ConfigError
-from pirl_rl.runs.load import refuse_links
+from pirl_rl.run_directory import RunDirectory
 
 KEPT = "tune.yaml"
-"""The settings that a loop began with."""
+"""The file with the settings of the loop's first start."""
 
 CHANGEABLE = ("rounds", "extra_rounds", "parallel", "out")
-"""Those that may be others when it goes on."""
+"""Settings that may differ when the loop is started again."""
 
 LOCK = ".lock"
 PATIENCE = 30.0
@@ -35,7 +35,7 @@ def check(out: Path, settings: dict) -> None:
         if any(not path.name.startswith(".") for path in out.iterdir()):
             raise ConfigError(f"out: {out} is not empty and no loop's directory, expected {KEPT} in it")
         return
-    refuse_links(out)
+    RunDirectory(out).refuse_links()
     before = OmegaConf.to_container(OmegaConf.load(out / KEPT))
     differing = [key for key in _differing(before, settings) if key not in CHANGEABLE]
     if differing:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 from pirl_rl.outer_loop.plan import Candidate, Frozen, Triple
@@ -13,10 +14,10 @@ class Result(Frozen):
     Attributes:
         checkpoint: the name under which later plans may start from it; None where there is nothing to start from.
         status: "done"; "collapsed", stopped by the guard and rolled back; "failed", ended with an error.
-        updates: of the whole chain since the loop's start.
-        metrics: of `summary.json`.
-        weights: the loss weights (TD, HJB, boundary) in force at its end.
-        collocation_jitter, collocation_replay_share: at its end, None where its collocation has none.
+        updates: number of updates of the whole chain since the loop's start.
+        metrics: the numbers of the run's summary.
+        weights: the loss weights (TD, HJB, boundary) in force at the end of training.
+        collocation_jitter, collocation_replay_share: the same for the collocation; None where it has no such setting.
         reason: why it failed or collapsed.
     """
 
@@ -74,3 +75,9 @@ class History(Frozen):
     def checkpoints(self) -> dict[str, Result]:
         """All that a plan may start from, by name."""
         return {one.checkpoint: one for one in (self.baseline, *self.results) if one.checkpoint is not None}
+
+
+def tolerance(baseline: Result) -> float:
+    """The 95% half-width of the difference of two success rates such as the baseline's."""
+    low, high = (baseline.metrics[name] for name in ("success_low", "success_high"))
+    return math.sqrt(2) * (high - low) / 2

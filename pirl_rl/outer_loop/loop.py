@@ -26,19 +26,19 @@ ASKED = 2
 """Times that an advisor is asked before the fallback steps in."""
 
 LONGEST_ANSWER, LONGEST_ERROR = 20_000, 2_000
-"""Characters of what is recorded of each."""
+"""Characters of an answer and of an error that are recorded."""
 
 
 @dataclass(frozen=True)
-class Settings:
+class LoopSettings:
     """What a loop is to do.
 
     Attributes:
-        rounds: up to the milestone.
-        candidates: of a round.
-        updates: of a candidate.
-        extra_rounds: past the milestone, as long as the round before found a new best.
-        start: the checkpoint that all begins from.
+        rounds: number of rounds up to the milestone.
+        candidates: number of candidates in each round.
+        updates: length of each candidate's training.
+        extra_rounds: further rounds past the milestone, each only if the round before found a new best.
+        start: the checkpoint from which the loop goes on.
         train: the user's overrides of every candidate's training.
         trust: modules outside the package that these name.
         final: names of the evaluators that judge a candidate.
@@ -60,13 +60,13 @@ class Loop:
     """Rounds of continuations.
 
     Args:
-        settings: how many.
+        settings: number of rounds and candidates, and how candidates are trained.
         record: where everything is kept and found again.
         advisor: plans; `Greedy` steps in for one that fails.
         launcher: runs the candidates' command lines.
     """
 
-    def __init__(self, settings: Settings, record: Record, advisor: Advisor, launcher: Launcher):
+    def __init__(self, settings: LoopSettings, record: Record, advisor: Advisor, launcher: Launcher):
         self.settings, self.record, self.advisor, self.launcher = settings, record, advisor, launcher
 
     def run(self, history: History) -> History:
@@ -157,9 +157,9 @@ class Loop:
             if fallback:
                 raise
             reasons = error.errors if isinstance(error, PlanError) else [f"{type(error).__name__}: {error}"]
-            told = [redact(reason)[:LONGEST_ERROR] for reason in reasons]
-            print(f"round {request.number}: {name} gave no plan: {'; '.join(told)[:500]}", flush=True)
-            return Attempt(advisor=name, answer=str(answer)[:LONGEST_ANSWER], errors=told)
+            reasons = [redact(reason)[:LONGEST_ERROR] for reason in reasons]
+            print(f"round {request.number}: {name} gave no plan: {'; '.join(reasons)[:500]}", flush=True)
+            return Attempt(advisor=name, answer=str(answer)[:LONGEST_ANSWER], errors=reasons)
         text = answer if len(answer) <= LONGEST_ANSWER else plan.model_dump_json()
         return Attempt(advisor=name, answer=text)
 

@@ -24,10 +24,10 @@ class Candidate(Frozen):
 
     Attributes:
         name: letters a-z, digits, - and _; unique in its round.
-        start_checkpoint: one of those on offer.
+        start_checkpoint: the name of a checkpoint of the history, from which the candidate goes on.
         schedule_initial, schedule_final: weights (TD, HJB, boundary) at both ends of the sigmoid.
-        schedule_center: its middle, in updates of this candidate.
-        schedule_sharpness: its rate, 1/update.
+        schedule_center: the middle of the sigmoid, in updates of this candidate.
+        schedule_sharpness: the rate of the sigmoid, 1/update.
         collocation_jitter: deviation of the steps around visited states at the schedule's end, see `ReplayCollocation`;
             None keeps that of the start. It moves there from the start's value.
         collocation_replay_share: share of collocation points near visited states at the schedule's end; likewise.

@@ -20,6 +20,7 @@ from pirl_rl.errors import RunError
 from pirl_rl.figures.comparison import draw_comparison
 from pirl_rl.figures.files import save_figures
 from pirl_rl.loggers import read_metrics
+from pirl_rl.run_directory import RunDirectory
 
 LOSSES = ("td_loss", "hjb_loss", "hjb_sup_loss", "boundary_loss")
 COLUMNS = (
@@ -36,8 +37,8 @@ COLUMNS = (
 )
 """Column of the table, key of summary.json, statistic over the group's runs; columns that no run has are left out."""
 
-class FinishedRun(NamedTuple):
-    """One run directory: its group, its summary.json, and the columns of its metrics.csv."""
+class RunRecord(NamedTuple):
+    """What a finished run left: its group, the numbers of its summary, and the columns of its metrics."""
 
     label: str
     summary: dict[str, float]
@@ -52,20 +53,21 @@ class FinishedRun(NamedTuple):
         return math.nan if value is None else float(value)
 
 
-def find_runs(folders: Sequence[str | Path]) -> dict[str, list[FinishedRun]]:
+def find_runs(folders: Sequence[str | Path]) -> dict[str, list[RunRecord]]:
     """All runs below the folders by label, "experiment method", in the order of their paths.
 
     Raises:
         RunError: no run below a folder, or a run that cannot be read.
     """
-    groups: dict[str, list[FinishedRun]] = {}
+    groups: dict[str, list[RunRecord]] = {}
     paths: dict[Path, None] = {}
     for folder in map(Path, folders):
-        found = [path.parent for path in sorted(folder.rglob("summary.json"))]
-        found = [path for path in found if (path / ".hydra" / "config.yaml").is_file()]
+        found = [path.parent for path in sorted(folder.rglob(str(RunDirectory.SUMMARY)))]
+        found = [path for path in found if RunDirectory(path).config.is_file()]
         if not found:
             raise RunError(
-                f"no runs found below {folder}: expected directories with summary.json and .hydra/config.yaml"
+                f"no runs found below {folder}: expected directories with {RunDirectory.SUMMARY} and "
+                f"{RunDirectory.CONFIG}"
             )
         paths |= {path.resolve(): None for path in found}
     for path in paths:
@@ -74,25 +76,26 @@ def find_runs(folders: Sequence[str | Path]) -> dict[str, list[FinishedRun]]:
     return groups
 
 
-def read_run(path: Path) -> FinishedRun:
+def read_run(path: Path) -> RunRecord:
     """Open one run directory.
 
     Raises:
         RunError: with the file and the reason.
     """
+    run = RunDirectory(path)
     try:
-        config = OmegaConf.load(path / ".hydra" / "config.yaml")
+        config = OmegaConf.load(run.config)
         names = [OmegaConf.select(config, key, throw_on_missing=True) for key in ("experiment_name", "method_name")]
-        summary = json.loads((path / "summary.json").read_text())
-        metrics = read_metrics(path / "metrics.csv")
+        summary = json.loads(run.summary.read_text())
+        metrics = read_metrics(run.metrics)
     except (OSError, ValueError, OmegaConfBaseException) as error:
         raise RunError(f"{path} cannot be read: {error}") from error
     if None in names:
-        raise RunError(f"{path}/.hydra/config.yaml: expected the keys experiment_name and method_name")
-    return FinishedRun(" ".join(map(str, names)), summary, metrics)
+        raise RunError(f"{run.config}: expected the keys experiment_name and method_name")
+    return RunRecord(" ".join(map(str, names)), summary, metrics)
 
 
-def comparison_table(groups: dict[str, list[FinishedRun]]) -> str:
+def comparison_table(groups: dict[str, list[RunRecord]]) -> str:
     """A Markdown table, a row for each group; a dash where no run of the group has the number."""
     runs = [run for group in groups.values() for run in group]
     columns = [column for column in COLUMNS if any(math.isfinite(run.get(column[1])) for run in runs)]

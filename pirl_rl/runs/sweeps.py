@@ -21,9 +21,9 @@ from omegaconf.errors import OmegaConfBaseException
 from pirl_rl.errors import RunError
 from pirl_rl.figures.files import save_figures
 from pirl_rl.figures.sweep import draw_grid, draw_line
+from pirl_rl.run_directory import RunDirectory
 from pirl_rl.runs.compare import number, read_run
 
-OVERRIDES = Path(".hydra") / "overrides.yaml"
 AVERAGED = "seed"
 UNSET = "default"
 """Stands for the value of a setting in the runs in which it was not typed."""
@@ -72,8 +72,8 @@ def find_jobs(folder: Path) -> list[Job]:
         RunError: there is none, or one that cannot be read.
     """
     jobs = []
-    for path in sorted(folder.rglob(str(OVERRIDES))):
-        run = path.parents[1]
+    for path in sorted(folder.rglob(str(RunDirectory.OVERRIDES))):
+        run = RunDirectory(path.parents[1])
         try:
             typed = OmegaConf.to_container(OmegaConf.load(path))
         except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException) as error:
@@ -81,9 +81,9 @@ def find_jobs(folder: Path) -> list[Job]:
         if not isinstance(typed, list):
             raise RunError(f"{path}: expected a list of overrides, got {type(typed).__name__}")
         settings = {key.lstrip("+~"): _plain(value) for key, _, value in (str(item).partition("=") for item in typed)}
-        jobs.append(Job(settings, read_run(run).summary if (run / "summary.json").is_file() else {}))
+        jobs.append(Job(settings, read_run(run.path).summary if run.summary.is_file() else {}))
     if not jobs:
-        raise RunError(f"no runs found below {folder}: expected directories with {OVERRIDES}")
+        raise RunError(f"no runs found below {folder}: expected directories with {RunDirectory.OVERRIDES}")
     return jobs
 
 

@@ -1,4 +1,4 @@
-"""What comes from outside: answers that lie in files, texts that are told."""
+"""What comes from outside: answers that lie in files, and texts that messages quote."""
 
 from __future__ import annotations
 

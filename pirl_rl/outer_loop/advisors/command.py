@@ -21,10 +21,10 @@ from pirl_rl.outer_loop.prompt import asked
 from pirl_rl.outer_loop.redaction import redact
 
 TAIL = 2_000
-"""Characters of a failed program's output that are told."""
+"""Characters of a failed program's output that the error quotes."""
 
 KEPT = 16 * TAIL
-"""Bytes of it in memory: a secret that is cut at their start is not told."""
+"""Bytes of that output in memory: more than are quoted, so that a secret that is cut at their start is not."""
 
 
 class Command:
@@ -100,7 +100,7 @@ def _run(line: Sequence[str], folder: Path, timeout: float) -> None:
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
     if reason:
-        raise AdvisorError(f"command: {reason}{tail.told()}")
+        raise AdvisorError(f"command: {reason}{tail.text()}")
 
 
 class _Tail(threading.Thread):
@@ -116,7 +116,7 @@ class _Tail(threading.Thread):
             while chunk := os.read(self.stream.fileno(), 65_536):
                 self.content = (self.content + chunk)[-KEPT:]
 
-    def told(self) -> str:
+    def text(self) -> str:
         self.join(timeout=1.0)  # a process that left the group may hold the stream open
         text = one_line(redact(self.content.decode("utf-8", errors="replace"))[-TAIL:])
         return f"; its output ends with: {text}" if text else ""

@@ -30,7 +30,7 @@ LONGEST_WAIT = 60.0
 """Seconds, also where a server asks for more."""
 
 EXCERPT = 300
-"""Characters of a refusal that are told."""
+"""Characters of a server's refusal that the error quotes."""
 
 
 class _Again(Exception):

@@ -1,4 +1,4 @@
-"""The start of a loop: the checkpoint that all continue from, measured as every candidate will be."""
+"""The baseline of an outer loop: the checkpoint from which all candidates go on, measured as each of them will be."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ from pirl_rl.evaluation import evaluate, metrics_of
 from pirl_rl.outer_loop.candidates import JUDGED
 from pirl_rl.outer_loop.history import Result
 from pirl_rl.outer_loop.plan import START
+from pirl_rl.run_directory import RunDirectory
 from pirl_rl.sampling.collocation import ReplayCollocation
 from pirl_rl.trainer import Trainer
 
 
 def measure(trainer: Trainer, path: Path, trust: Sequence[str] = ()) -> Result:
-    """The baseline.
+    """Evaluate the start of a loop.
 
     Args:
-        trainer: of a candidate, begun from the start.
+        trainer: a candidate's, with the networks of the start.
         path: the start's checkpoint, in its run directory.
         trust: modules outside the package that its configuration may name.
 
@@ -42,19 +43,13 @@ def measure(trainer: Trainer, path: Path, trust: Sequence[str] = ()) -> Result:
         raise ConfigError(f"start: {path} ended with settings that no plan has: {error.errors()[0]['msg']}") from None
 
 
-def tolerance(baseline: Result) -> float:
-    """The 95% half-width of the difference of two success rates such as the baseline's."""
-    low, high = (baseline.metrics[name] for name in ("success_low", "success_high"))
-    return math.sqrt(2) * (high - low) / 2
-
-
 def _in_force(path: Path, trainer: Trainer, trust: Sequence[str]) -> dict[str, Any]:
     """Weights and settings of the collocation at the start's last update, by its own run's configuration.
 
     Where the candidates' collocation has no such settings there are none; where only the start's had none, they begin
     with the candidates' own.
     """
-    config = load_config(path.parent.parent)
+    config = load_config(RunDirectory.of_checkpoint(path).path)
     config.device, before = "cpu", make_trainer(config, None, trust)
     last = max(_update(checkpoint.load(path)) - 1, 0)
     settings: dict[str, Any] = {"weights": before.curriculum.weights(last)}

@@ -1,0 +1,126 @@
+"""The road from Python: train, open, evaluate and check, as `pirl_rl.train(...)` and so on."""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import inspect
+import warnings
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from pirl_rl.assembly import make_evaluation_simulator, make_evaluators
+from pirl_rl.commands.console import named_modules, override, quiet_libraries
+from pirl_rl.commands.settings import compose_run, run_folder, typed_settings
+from pirl_rl.commands.train import train_new
+from pirl_rl.errors import ArgumentError, ConfigError
+from pirl_rl.evaluation import evaluate as call_evaluators
+from pirl_rl.evaluation import metrics_of
+from pirl_rl.evaluation.monte_carlo import monte_carlo
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.problem import check_problem as check
+from pirl_rl.runs.load import Run, load_run
+
+__all__ = ["check", "evaluate", "load_run", "monte_carlo", "train"]
+
+
+def train(
+    problem_or_experiment: ReachAvoidProblem | type[ReachAvoidProblem] | str,
+    *,
+    folder: str | PathLike[str] | None = None,
+    **settings: Any,
+) -> Run:
+    """Train, exactly as `python -m pirl_rl.train` does, into a new run directory.
+
+        run = pirl_rl.train("reach1d", updates=2_000, seed=3)
+        run = pirl_rl.train(MyProblem, method="pirl", **{"schedule.center": 1e3})
+
+    Args:
+        problem_or_experiment: the name of an experiment, or a problem of your own, a class or an object, which is
+            trained with the settings of the experiment `own`. A class that can be imported is named by the run's
+            configuration. Any other problem, an object or a notebook's class, is not, and such a run opens with
+            `load_run(folder, problem=...)`.
+        folder: the run directory, new or empty; default `runs/<experiment>/<time>-<seed>`.
+        **settings: an argument of the trainer (`updates=200`), a key of the configuration (`seed=3`, `compile=False`),
+            a choice of a group (`method="td3"`, `logger="none"`), a nested mapping (`schedule={"center": 1e3}`) or a
+            name with dots (`**{"schedule.center": 1e3}`).
+
+    Returns:
+        The run, opened from its directory.
+
+    Raises:
+        ConfigError: an unknown setting, with those that are known, or a value that cannot be built.
+        ProblemError: a problem that contradicts itself.
+        DivergenceError: a loss became infinite or exploded.
+        Interrupted: training was asked to stop; it can go on from the run directory.
+    """
+    if "resume" in settings:
+        raise ConfigError("resume: a run goes on with python -m pirl_rl.train resume=RUN_DIR, expected a new one here")
+    experiment, problem, named, trust = _subject(problem_or_experiment)
+    config, typed = compose_run(experiment, {**named, **settings})
+    default = run_folder(config)
+    path = Path(default if folder is None else folder).absolute()
+    with warnings.catch_warnings():
+        quiet_libraries()
+        train_new(config, path, typed, trust, problem)
+    return load_run(path, [*config.trust, *named_modules(typed), *trust], problem=problem)
+
+
+def _subject(subject: Any) -> tuple[str, ReachAvoidProblem | None, dict[str, str], list[str]]:
+    """The experiment, the problem where no configuration can name it, else the settings that do, and what they trust.
+
+    Raises:
+        ArgumentError: neither a name nor a problem.
+    """
+    if isinstance(subject, str):
+        return subject, None, {}, []
+    if inspect.isclass(subject) and issubclass(subject, ReachAvoidProblem):
+        if missing := ", ".join(sorted(subject.__abstractmethods__)):
+            raise ArgumentError(f"{subject.__qualname__} lacks {missing}")
+        if not _importable(subject):
+            return "own", subject(), {}, []
+        return "own", None, {"env.problem._target_": f"{subject.__module__}.{subject.__name__}"}, [subject.__module__]
+    if isinstance(subject, ReachAvoidProblem):
+        return "own", subject, {}, []
+    raise ArgumentError(
+        f"expected the name of an experiment, a ReachAvoidProblem or a class of these, got {type(subject).__name__}"
+    )
+
+
+def _importable(subject: type) -> bool:
+    """Whether another process finds the class under its name; `__main__` is another module there."""
+    if subject.__module__ == "__main__":
+        return False
+    try:
+        return getattr(importlib.import_module(subject.__module__), subject.__name__, None) is subject
+    except ImportError:
+        return False
+
+
+def evaluate(run: Run | str | PathLike[str], *, trust: Sequence[str] = (), **settings: Any) -> dict[str, float]:
+    """Call a run's final evaluators again, with other samples if asked; nothing is written.
+
+        pirl_rl.evaluate(run, final=["success"], success={"episodes": 100_000})
+
+    Args:
+        run: an open run, or its directory.
+        trust: modules outside pirl_rl that its configuration may name.
+        **settings: entries of `evaluation`, or any key of the run's configuration, as in `train`.
+
+    Returns:
+        The metrics by name.
+
+    Raises:
+        ConfigError: an unknown setting, with those that are known, or a value that cannot be built.
+    """
+    if not isinstance(run, Run):
+        run = load_run(Path(run), trust)
+    config = copy.deepcopy(run.config)
+    typed = typed_settings(settings, config, "evaluation")
+    for text in typed:
+        override(config, text)
+    evaluators = make_evaluators(config.evaluation, "final", [*trust, *named_modules(typed)])
+    simulator = make_evaluation_simulator(config, run.problem)
+    return metrics_of(call_evaluators(run.solution, simulator, evaluators))

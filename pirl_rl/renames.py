@@ -1,0 +1,124 @@
+"""Configurations of earlier formats in the present one's words: tables of what moved, and of what is said otherwise.
+
+Format 1 named the actor's rule by a word and kept its arguments in the loss, gave every evaluator a simulator of its
+own, and counted the schedule of a stage in a unit that the run then stretched. Here are plain nested dicts, with all
+references resolved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+Node = dict[str, Any]
+
+RULES = "pirl_rl.actor_rules"
+STATES = "pirl_rl.sampling.initial_states"
+COLLOCATION = "pirl_rl.sampling.collocation"
+DRIFT = "pirl_rl.problems.drift"
+
+MOVED = {
+    **{f"pirl_rl.initial_states.{name}": f"{STATES}.{name}" for name in ("UniformStates", "VisitedStates")},
+    "pirl_rl.initial_states.EquilibriumStates": f"{DRIFT}.starts.EquilibriumStates",
+    **{f"pirl_rl.collocation.{name}": f"{COLLOCATION}.{name}" for name in ("Collocation", "ReplayCollocation")},
+    "pirl_rl.collocation.BoundarySampler": "pirl_rl.sampling.boundary.BoundarySampler",
+    "pirl_rl.evaluation.DriftStates": f"{DRIFT}.reference_states.DriftStates",
+}
+"""`_target_` of format 1 -> present `_target_`."""
+
+SIMULATOR = ("dt", "substeps", "crossing")
+"""Arguments of a simulator, which the environment has and each evaluator of format 1 had too."""
+
+RULE_DEFAULTS = {"actor_rule": "both", "model_steps": 1, "ppo_clip": 0.2}
+"""What the loss of format 1 took where its configuration was silent."""
+
+LOSS_DROPPED = ("model_steps", "simulator", "exploration_noise", "ppo_clip")
+"""Arguments of the loss of format 1 that are the actor rule's."""
+
+UPDATE_COUNTS, PER_UPDATE = ("center", "start", "end"), ("steepness",)
+"""Arguments of a schedule that are numbers of updates, and those that are numbers per update."""
+
+
+def upgraded(config: Mapping[str, Any]) -> Node:
+    """A configuration of format 1 as one of the present format.
+
+    Args:
+        config: nested dicts and lists with all references resolved; it is left as it is.
+
+    Returns:
+        A new dict. `pirl`, to which only references pointed, is left out.
+    """
+    new: Node = {name: _moved(value) for name, value in config.items() if name != "pirl"}
+    loss, collector = _dict(new.get("loss")), _dict(new.get("collector"))
+    rule = {name: loss.get(name, default) for name, default in RULE_DEFAULTS.items()}
+    rule["exploration_noise"] = collector.get("exploration_noise", 0.0)
+    if loss:
+        new["loss"] = {name: value for name, value in loss.items() if name not in LOSS_DROPPED}
+        new["loss"]["actor_rule"] = _actor_rule(rule)
+    if stages := new.get("stages"):
+        stretch = new["trainer"]["updates"] / sum(stage["updates"] for stage in stages)
+        new["stages"] = [_stage(stage, rule, stretch) for stage in stages]
+    if evaluation := _dict(new.get("evaluation")):
+        new["evaluation"] = _evaluation(evaluation, _dict(new.get("env")))
+    return new
+
+
+def _dict(value: Any) -> Node:
+    """The settings of a node; none where something else stands in its place, which is refused where it is built."""
+    return value if isinstance(value, dict) else {}
+
+
+def _moved(value: Any) -> Any:
+    """A copy with every `_target_` where it is found at present."""
+    if isinstance(value, Mapping):
+        copy = {name: _moved(entry) for name, entry in value.items()}
+        if "_target_" in copy:
+            copy["_target_"] = MOVED.get(copy["_target_"], copy["_target_"])
+        return copy
+    return [_moved(entry) for entry in value] if isinstance(value, list) else value
+
+
+def _actor_rule(rule: Mapping[str, Any]) -> Node | Any:
+    """The node of a rule that format 1 named by a word; another value stays, to be refused where it is built."""
+    q, hamiltonian = {"_target_": f"{RULES}.Q"}, {"_target_": f"{RULES}.Hamiltonian"}
+    nodes = {
+        "q": q,
+        "hamiltonian": hamiltonian,
+        "both": {"_target_": f"{RULES}.Sum", "rules": [q, hamiltonian]},
+        "model": {"_target_": f"{RULES}.LookAhead", "steps": rule["model_steps"]},
+        "ppo": {
+            "_target_": f"{RULES}.ClippedSurrogate",
+            "clip": rule["ppo_clip"],
+            "deviation": rule["exploration_noise"],
+        },
+    }
+    return nodes.get(rule["actor_rule"], rule["actor_rule"])
+
+
+def _stage(stage: Node, run: Mapping[str, Any], stretch: float) -> Node:
+    """A stage whose length is a share, with its rule as a node and its schedule in updates of the run."""
+    new = {"share" if name == "updates" else name: value for name, value in stage.items() if name != "model_steps"}
+    own = {name: stage[name] for name in run if stage.get(name) is not None}
+    rule = _actor_rule({**run, **own})
+    if "actor_rule" in own or rule != _actor_rule(run):
+        new["actor_rule"] = rule
+    if isinstance(schedule := new.get("schedule"), dict):
+        new["schedule"] = {name: _stretched(name, value, stretch) for name, value in schedule.items()}
+    return new
+
+
+def _stretched(name: str, value: Any, stretch: float) -> Any:
+    if name in UPDATE_COUNTS:
+        return value * stretch
+    return value / stretch if name in PER_UPDATE else value
+
+
+def _evaluation(evaluation: Node, env: Mapping[str, Any]) -> Node:
+    """Evaluators without simulators, and the environment's for all of them, by reference."""
+    new = {
+        name: {key: entry for key, entry in value.items() if key not in SIMULATOR}
+        if isinstance(value, dict) and "_target_" in value
+        else value
+        for name, value in evaluation.items()
+    }
+    return {**new, "simulator": {name: f"${{env.{name}}}" for name in SIMULATOR if name in env}}
