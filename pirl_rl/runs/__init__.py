@@ -1,0 +1,1 @@
+"""Finished runs: opened, compared, and sorted into sweeps."""
