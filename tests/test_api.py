@@ -151,7 +151,7 @@ def test_a_class_that_can_be_imported_is_named_by_the_configuration(tmp_path):
         ({"seed": {"a": 1}}, r"seed\.a: expected one of no more names"),
         ({"method": "nope"}, "nope"),
         ({"updates": "many"}, "trainer.updates: expected int, got 'many'"),
-        ({"updates": object()}, "trainer.updates: expected a number, text"),
+        ({"updates": slice(3)}, "trainer.updates: expected a number, text"),
         ({"resume": "run"}, "resume"),
         ({"collocation": {"_target_": "pirl_rl.sampling.collocation.Collocation", "sise": 3}}, "sise"),
     ],
