@@ -15,7 +15,7 @@ COMMANDS = (
     ("python -m pirl_rl.train +experiment=reach1d start=RUN_DIR", "begin from another run's networks"),
     ("python -m pirl_rl.train +experiment=reach1d --cfg job", "show all settings"),
     ("python -m pirl_rl.evaluate run=RUN_DIR", "evaluate a run again, with other samples or simulators if asked"),
-    ("python -m pirl_rl.tune +experiment=drift start=RUN_DIR", "go on from a run in rounds that an advisor plans"),
+    ("python -m pirl_rl.tune +experiment=reach1d start=RUN_DIR", "go on from a run in rounds that an advisor plans"),
     ("python -m pirl_rl.compare RUN_DIRS", "one table and one figure of many runs"),
     ("python -m pirl_rl.sweeps DIR", "a table and a heat map of a sweep"),
 )

@@ -1,4 +1,4 @@
-"""Tune: `python -m pirl_rl.tune +experiment=drift start=RUN [advisor=NAME] [rounds=3] [candidates=2] [out=DIR] ...`.
+"""Tune: `python -m pirl_rl.tune +experiment=reach1d start=RUN [advisor=NAME] [rounds=3] [candidates=2] [out=DIR] ...`.
 
 Rounds of continuations, each planned by an advisor. Started again with the same `out` it goes on where it was; with
 `--report out=DIR` it only draws what there is.
