@@ -20,10 +20,11 @@ train: $(READY) ## Train EXPERIMENT=drift; ARGS="seed=3 device=cpu" overrides it
 test: $(READY) ## Run the tests that are neither slow nor gpu; ARGS go to pytest
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
 
-lint: $(READY) ## Check style, format and types
+lint: $(READY) ## Check style, format, types and the floors of the package
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
+	$(BIN)/lint-imports --no-logo
 
 docs: $(READY) ## Build the documentation site from nothing; open docs/_build/html/index.html
 	rm -rf docs/_build docs/_generated
@@ -37,7 +38,7 @@ figures: $(READY) ## Compare all runs below runs/: a table and a figure in runs/
 	$(BIN)/python -m pirl_rl.compare runs --out runs/comparison
 
 clean: ## Remove .venv, caches and build output; runs stay
-	rm -rf $(VENV) build dist docs/_build docs/_generated *.egg-info .pytest_cache .ruff_cache
+	rm -rf $(VENV) build dist docs/_build docs/_generated *.egg-info .pytest_cache .ruff_cache .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # pip comes last into a new environment and .setup last of all, so what was interrupted starts again.
