@@ -117,6 +117,12 @@ class Curriculum:
         schedule, count, length = self._schedule(update)
         return schedule(count, length)
 
+    def largest_weights(self) -> Weights:
+        """The largest weight of each term over the run, looked up at about a thousand updates."""
+        updates = (*range(0, self.updates, max(1, self.updates // 1_000)), self.updates)
+        td, hjb, boundary = zip(*map(self.weights, updates), strict=True)
+        return max(td), max(hjb), max(boundary)
+
     def progress(self, update: int) -> float:
         """How far the schedule in force has come at an update, in [0, 1]."""
         schedule, count, length = self._schedule(update)

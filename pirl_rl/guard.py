@@ -7,8 +7,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from pirl_rl.errors import CollapseError
-from pirl_rl.evaluation import Success
+from pirl_rl.errors import ArgumentError, CollapseError
+from pirl_rl.evaluation import Evaluator, Success
 from pirl_rl.learner import Learner
 from pirl_rl.simulator import Simulator
 
@@ -90,6 +90,23 @@ class Rollback:
         self.good: dict[str, Any] = {}
         self.good_at: int | None = None
         self.collapsed_at: int | None = None
+
+    @classmethod
+    def of(
+        cls, learner: Learner, during: Mapping[str, Evaluator], simulator: Simulator, evaluate_every: int
+    ) -> Rollback:
+        """The rollback of a run with these evaluators.
+
+        Raises:
+            ArgumentError: no evaluation of success during training, by which it could judge.
+        """
+        success = next((one for one in during.values() if isinstance(one, Success)), None)
+        if success is None or not evaluate_every:
+            raise ArgumentError(
+                "trainer.rollback: it judges evaluations during training, expected trainer.evaluate_every >= 1 and "
+                f"success in evaluation.during, got {evaluate_every} and {list(during)}"
+            )
+        return cls(learner, success, simulator)
 
     def judge(self, update: int, row: Mapping[str, float] | None = None) -> None:
         """Look at the networks after an update, through the row's metrics where it has them.

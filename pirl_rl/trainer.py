@@ -11,33 +11,31 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict
 
 from pirl_rl import checkpoint
 from pirl_rl.collectors import TransitionCollector
 from pirl_rl.curriculum import Curriculum, Stage, StageSettings
 from pirl_rl.errors import ArgumentError, DivergenceError, Interrupted
-from pirl_rl.evaluation import Evaluator, Evidence, Success, evaluate, metrics_of
+from pirl_rl.evaluation import Evaluator, Evidence, evaluate, metrics_of
 from pirl_rl.files import replacing
 from pirl_rl.guard import Rollback
 from pirl_rl.learner import Learner
 from pirl_rl.loggers import MetricsLogger, NoLogger
 from pirl_rl.progress import Progress, interruptible
 from pirl_rl.run_directory import RunDirectory
+from pirl_rl.sampling.batches import BatchSampler
 from pirl_rl.sampling.boundary import BoundarySampler
 from pirl_rl.sampling.collocation import Collocation
 from pirl_rl.schedules import WEIGHTS, Schedule
 from pirl_rl.simulator import Simulator
 
-NEGLIGIBLE = 1e-6
-"""Weights below this share of their largest of the run, as a sigmoid has far from its center, are taken for zero."""
-
 
 class Trainer:
-    """Trains a learner and leaves the evidence in a run directory.
+    """Trains networks and leaves the evidence in a run directory.
 
     Attributes:
-        evidence: of the evaluators of the end, by name; empty before the end of training.
+        solution: the networks as they stand, with their problem.
+        evidence: what the final evaluators measured, by name; empty before the end of training.
 
     Args:
         learner: makes the updates.
@@ -50,13 +48,17 @@ class Trainer:
         log_every: updates between rows of metrics.
         evaluate_every: updates between evaluations during training; 0 for none.
         checkpoint_every: updates between checkpoints; 0 for the last one only.
-        rollback: end the run where training collapses, with the networks of the last good evaluation; see `Guard`.
+        rollback: whether a run that collapses ends with the networks of its last good evaluation, see `Guard`.
         during, final: evaluators during and after training, by name.
-        simulator: plays the paths of the evaluators; default that of the problem with its own defaults.
-        logger: where rows go.
+        simulator: plays the paths of the evaluators; default a `Simulator` of the problem with its default steps.
+        logger: takes the rows of metrics.
         folder: the run directory; None keeps everything in memory.
-        config: what made this run, for loggers.
-        seed: of the sampling of points.
+        config: the settings of the run, for loggers that show them.
+        seed: of the collocation and boundary points.
+
+    Raises:
+        ArgumentError: a number out of range, an actor rule that does not fit the critics or the noise, or `rollback`
+            without evaluations of success.
     """
 
     def __init__(
@@ -90,7 +92,7 @@ class Trainer:
         ):
             if not (isinstance(value, int) and value >= least):
                 raise ArgumentError(f"trainer.{name}: expected an integer >= {least}, got {value!r}")
-        self.learner, self.collector, self.collocation, self.boundary = learner, collector, collocation, boundary
+        self.learner, self.collector = learner, collector
         self.curriculum = Curriculum(schedule, updates, stages or (Stage(),))
         self._run_settings = StageSettings(
             initial_states=collector.initial_states,
@@ -104,7 +106,7 @@ class Trainer:
         for stage in self.curriculum.stages:
             settings = stage.over(self._run_settings)
             learner.loss.check_rule(settings.actor_rule, settings.exploration_noise)
-        self.updates, self.batch_size = updates, batch_size
+        self.updates = updates
         self.log_every, self.evaluate_every, self.checkpoint_every = log_every, evaluate_every, checkpoint_every
         self.during, self.final = dict(during or {}), dict(final or {})
         self.simulator = simulator or Simulator(learner.loss.problem)
@@ -113,23 +115,22 @@ class Trainer:
         self.logger = logger if logger is not None and self.folder is not None else NoLogger()
         self.config = dict(config or {})
         self.solution = learner.loss.solution()
-        self.rng = torch.Generator(self.solution.device).manual_seed(seed)
-        weights = [self.curriculum.weights(k) for k in (*range(0, updates, max(1, updates // 1_000)), updates)]
-        self.largest = tuple(max(values) for values in zip(*weights, strict=True))
-        self.rollback = self._make_rollback() if rollback else None
+        self.batches = BatchSampler(
+            collector.buffer,
+            collocation,
+            boundary,
+            batch_size,
+            self.curriculum.largest_weights(),
+            self.solution.device,
+            seed,
+        )
+        self.rollback: Rollback | None = None
+        if rollback:
+            self.rollback = Rollback.of(learner, self.during, self.simulator, evaluate_every)
         self.update, self.saved, self.wall_seconds = 0, 0, 0.0
 
-    def _make_rollback(self) -> Rollback:
-        success = next((one for one in self.during.values() if isinstance(one, Success)), None)
-        if success is None or not self.evaluate_every:
-            raise ArgumentError(
-                "trainer.rollback: it judges evaluations during training, expected trainer.evaluate_every >= 1 and "
-                f"success in evaluation.during, got {self.evaluate_every} and {list(self.during)}"
-            )
-        return Rollback(self.learner, success, self.simulator)
-
     def train(self) -> dict[str, float]:
-        """Run to the last update; returns the summary.
+        """Train to the last update and evaluate; returns the summary.
 
         Raises:
             DivergenceError: a loss exploded; the last checkpoint is from before.
@@ -180,7 +181,8 @@ class Trainer:
                     self._enter_stage()
                 self.collector.step(k)
                 weights, decay = self.curriculum.weights(k), self.curriculum.decay(k)
-                terms = self.learner.update(self.sample(), k, weights, decay)
+                batch = self.batches.sample(weights, self.curriculum.progress(k))
+                terms = self.learner.update(batch, k, weights, decay)
                 self.update, self.wall_seconds = k + 1, time.perf_counter() - started
                 row = self._row(k, terms)
                 if row:
@@ -199,21 +201,8 @@ class Trainer:
         """Take over what the stage of the next update sets, and the run's own for the rest."""
         settings = self.curriculum.stage(self.update).over(self._run_settings)
         self.collector.play(settings.initial_states, settings.n_steps, settings.exploration_noise)
-        self.collocation = settings.collocation
+        self.batches.collocation = settings.collocation
         self.learner.apply(settings)
-
-    def sample(self) -> TensorDict:
-        """The batch of one update; a term of negligible weight is left out of the work."""
-        weights = self.curriculum.weights(self.update)
-        td, hjb, boundary = (w > NEGLIGIBLE * most for w, most in zip(weights, self.largest, strict=True))
-        replay = self.collector.buffer.sample(self.batch_size)
-        parts = {"replay": replay if td else replay.exclude("next")}
-        if hjb:
-            progress = self.curriculum.progress(self.update)
-            parts["collocation"] = self.collocation.sample(self.rng, replay, progress)
-        if boundary:
-            parts["boundary"] = self.boundary.sample(self.rng, replay)
-        return TensorDict(parts).to(self.solution.device)
 
     def _row(self, k: int, terms: Mapping[str, torch.Tensor]) -> dict[str, float]:
         """The metrics of an update, on those that log; empty on others."""
@@ -268,19 +257,19 @@ class Trainer:
             "learner": self.learner.state_dict(),
             "collector": self.collector.state_dict(),
             "rollback": None if self.rollback is None else self.rollback.state_dict(),
-            "rng": self.rng.get_state(),
+            "rng": self.batches.rng.get_state(),
             "torch_rng": torch.get_rng_state(),
             "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a state; call before `train`."""
+        """Continue from a state; call it before `train`."""
         self.update, self.saved, self.wall_seconds = state["update"], state["update"], state["wall_seconds"]
         self.learner.load_state_dict(state["learner"])
         self.collector.load_state_dict(state["collector"])
         if self.rollback is not None and state.get("rollback") is not None:
             self.rollback.load_state_dict(state["rollback"])
-        checkpoint.restore_rng(self.rng, state["rng"])
+        checkpoint.restore_rng(self.batches.rng, state["rng"])
         torch.set_rng_state(state["torch_rng"])
         if len(state["cuda_rng"]) == torch.cuda.device_count():
             torch.cuda.set_rng_state_all(state["cuda_rng"])

@@ -52,16 +52,20 @@ def metrics(evaluator, solution, **steps) -> dict[str, float]:
     return evaluator(solution, Simulator(solution.problem, **steps)).metrics()
 
 
-def at_update(trainer: Trainer, update: int, action) -> None:
-    """Call an action just before an update, counted from 1."""
+def at_each_update(trainer: Trainer, action) -> None:
+    """Call an action with the number of each update, from 0, just before the update."""
     step = trainer.collector.step
 
     def instead(k: int) -> None:
-        if k == update - 1:
-            action()
+        action(k)
         step(k)
 
     trainer.collector.step = instead
+
+
+def at_update(trainer: Trainer, update: int, action) -> None:
+    """Call an action just before an update, counted from 1."""
+    at_each_update(trainer, lambda k: action() if k == update - 1 else None)
 
 
 def interrupt() -> None:

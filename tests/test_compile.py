@@ -8,7 +8,7 @@ from functools import partial
 
 import pytest
 import torch
-from small import command, small_trainer
+from small import at_each_update, command, small_trainer
 from torch._dynamo.utils import counters
 
 from pirl_rl import learner
@@ -42,8 +42,7 @@ def eager_calls(monkeypatch) -> list[str]:
 def train_over_rules(tmp_path, *overrides: str):
     trainer = small_trainer(tmp_path, *RULES, *overrides)
     rules = []
-    sample = trainer.sample
-    trainer.sample = lambda: rules.append(type(trainer.learner.loss.actor_rule)) or sample()
+    at_each_update(trainer, lambda k: rules.append(type(trainer.learner.loss.actor_rule)))
     trainer.train()
     assert rules == [LookAhead] * 4 + [ClippedSurrogate] * 4
     return trainer

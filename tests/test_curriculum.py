@@ -85,12 +85,12 @@ def test_the_trainer_takes_over_what_a_stage_sets(tmp_path):
     def watch(k):
         law = trainer.collector.initial_states.box
         rates = trainer.collector.n_steps, trainer.learner.actor_every, type(trainer.learner.loss.actor_rule)
-        seen.append((law and law.low, trainer.collocation.size, *rates))
+        seen.append((law and law.low, trainer.batches.collocation.size, *rates))
         step(k)
 
     trainer.collector.step = watch
     trainer.train()
-    size = small_trainer(tmp_path / "other", *STAGES).collocation.size
+    size = small_trainer(tmp_path / "other", *STAGES).batches.collocation.size
     assert seen == [((0.0,), size, 1, 2, Hamiltonian)] * 5 + [(None, 7, 3, 5, LookAhead)] * 5
 
 
@@ -119,15 +119,14 @@ def test_resume_inside_a_stage_is_exact(stages, stop, end, tmp_path):
 def test_a_stage_of_policy_gradients_follows_its_own_noise_alone(collector, tmp_path):
     trainer = small_trainer(tmp_path, *POLICY, f"collector={collector}", "collector.warmup_frames=128")
     seen = []
-    sample = trainer.sample
 
-    def watch():
+    def watch(weights, progress):
         loss, replay = trainer.learner.loss, trainer.collector.buffer[:]
         off = (replay["action"] - replay["loc"]).abs()
         seen.append((type(loss.actor_rule), trainer.collector.exploration_noise, len(replay) >= 128, off.amax().item()))
-        return sample()
+        return sample(weights, progress)
 
-    trainer.sample = watch
+    sample, trainer.batches.sample = trainer.batches.sample, watch
     trainer.train()
     rules = [(Hamiltonian, 0.0, True)] * 3 + [(ClippedSurrogate, 0.3, True)] * 6 + [(Hamiltonian, 0.1, True)] * 3
     assert [one[:3] for one in seen] == rules

@@ -132,8 +132,8 @@ def reverse(trainer: Trainer) -> None:
 
 
 def spoil(trainer: Trainer) -> None:
-    sample = trainer.boundary.sample
-    trainer.boundary.sample = lambda rng, *rest: (batch := sample(rng)).set("value", batch["value"] * math.nan)
+    sample = trainer.batches.boundary.sample
+    trainer.batches.boundary.sample = lambda rng, *rest: (batch := sample(rng)).set("value", batch["value"] * math.nan)
 
 
 def networks(trainer: Trainer) -> dict:

@@ -60,7 +60,7 @@ def test_last_brings_networks_optimisers_and_transitions(first, tmp_path):
     assert 0 < cursor < 600  # it was written around its end
     mine = trainer.collector.state_dict()["buffer"]
     assert_same(transitions(mine), transitions(buffer, cursor))
-    assert not torch.equal(trainer.rng.get_state(), left["rng"])
+    assert not torch.equal(trainer.batches.rng.get_state(), left["rng"])
     trainer.collector.start()
     assert trainer.collector.buffer.write_count == 600  # no warm-up
     trainer.collector.step(0)

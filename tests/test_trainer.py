@@ -99,13 +99,18 @@ def test_rows_hold_the_weights_losses_and_evaluations(whole):
     assert float(rows[20]["learning_rate"]) < float(rows[1]["learning_rate"])
 
 
+def batch(trainer, k: int):
+    """The batch of an update."""
+    return trainer.batches.sample(trainer.curriculum.weights(k), trainer.curriculum.progress(k))
+
+
 def test_a_term_is_left_out_while_its_weight_is_negligible(tmp_path):
     """A sigmoid of steepness 5 is 4e-6 at 2.5 updates before its center, and below 1e-6 at 3 before."""
     trainer = small_trainer(tmp_path, "method=pirl", "schedule.center=9.5", "schedule.steepness=5")
     trainer.collector.start()
     parts = []
-    for trainer.update in range(20):
-        parts.append("collocation" in trainer.sample().keys())
+    for k in range(20):
+        parts.append("collocation" in batch(trainer, k).keys())
     assert parts == [False] * 7 + [True] * 13
 
 
@@ -114,15 +119,15 @@ def test_terms_without_weight_are_left_out(tmp_path):
     for method, terms in kept.items():
         trainer = small_trainer(tmp_path / method, f"method={method}")
         trainer.collector.start()
-        assert set(trainer.learner.loss.critic_loss(trainer.sample())[1]) == terms
+        assert set(trainer.learner.loss.critic_loss(batch(trainer, 0))[1]) == terms
 
 
 def test_nan_stops_with_update_and_term(tmp_path):
     trainer = small_trainer(tmp_path, "method=pinn")
-    sample = trainer.collocation.sample
+    sample = trainer.batches.collocation.sample
 
     def spoil():
-        trainer.collocation.sample = lambda rng, *rest: sample(rng).apply(
+        trainer.batches.collocation.sample = lambda rng, *rest: sample(rng).apply(
             lambda x: x * math.nan if x.is_floating_point() else x
         )
 
@@ -142,8 +147,10 @@ def test_explosion_stops_with_update_and_term(tmp_path):
 
 
 def scale_boundary(trainer, factor: float) -> None:
-    sample = trainer.boundary.sample
-    trainer.boundary.sample = lambda rng, *rest: (batch := sample(rng)).set("value", batch["value"] * factor + factor)
+    sample = trainer.batches.boundary.sample
+    trainer.batches.boundary.sample = lambda rng, *rest: (batch := sample(rng)).set(
+        "value", batch["value"] * factor + factor
+    )
 
 
 def test_spoilt_networks_are_not_saved(tmp_path):

@@ -53,9 +53,9 @@ def _in_force(path: Path, trainer: Trainer, trust: Sequence[str]) -> dict[str, A
     config.device, before = "cpu", make_trainer(config, None, trust)
     last = max(_update(checkpoint.load(path)) - 1, 0)
     settings: dict[str, Any] = {"weights": before.curriculum.weights(last)}
-    if isinstance(trainer.collocation, ReplayCollocation):
-        own = before.curriculum.stage(last).collocation or before.collocation
-        ends, progress = trainer.collocation, 0.0
+    if isinstance(trainer.batches.collocation, ReplayCollocation):
+        own = before.curriculum.stage(last).collocation or before.batches.collocation
+        ends, progress = trainer.batches.collocation, 0.0
         if isinstance(own, ReplayCollocation):
             ends, progress = own, before.curriculum.progress(last)
         for name in ("jitter", "replay_share"):
