@@ -53,7 +53,7 @@ def test_widened_box_is_covered_to_its_edges(sampler):
 def test_sobol_points_are_more_even_than_random_ones():
     """2^10 scrambled points: each of 32 equal strips of either axis has its share, up to one point."""
     problem = Reach1D()
-    points = Collocation(problem, 1024, "sobol").sample(make_rng())
+    points = Collocation(problem, 1024, "sobol", tau_power=1.0).sample(make_rng())
     for unit in (points["tau"] / problem.horizon, (points["state"] + 2) / 4):
         counts = torch.histc(unit, 32, 0, 1)
         assert (counts - 32).abs().max() <= 1

@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 from small import small_config, small_trainer
 
 from pirl_rl import load_run
+from pirl_rl.assembly import make_trainer
 from pirl_rl.configuration import build, load_config, resolve
 from pirl_rl.errors import ConfigError
 from pirl_rl.problems import Reach1D
@@ -122,12 +123,21 @@ def edited(run):
     path.write_text(before)
 
 
-@pytest.mark.parametrize("key", ["env.problem", "actor", "critic", "loss"])
-def test_hostile_run_directory_runs_nothing(key, edited, tmp_path):
+@pytest.mark.parametrize(
+    ("key", "reads"),
+    [
+        ("env.problem", load_run),
+        ("actor", load_run),
+        ("critic", load_run),
+        ("loss", lambda folder: make_trainer(load_config(folder))),
+    ],
+)
+def test_hostile_run_directory_runs_nothing(key, reads, edited, tmp_path):
+    """Reading V builds no loss; training further does."""
     proof = tmp_path / "ran"
     folder = edited(key, {"_target_": "os.system", "command": f"touch {proof}"})
     with pytest.raises(ConfigError, match=r"os\.system"):
-        load_run(folder)
+        reads(folder)
     assert not proof.exists()
 
 

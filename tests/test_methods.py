@@ -7,7 +7,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from pirl_rl.assembly import make_trainer
-from pirl_rl.commands.composition import arguments, compose
+from pirl_rl.commands.composition import arguments, compose, drop_leftovers
 from pirl_rl.commands.methods import check_method, owned
 from pirl_rl.configuration import CONF, parameters_of, resolve
 from pirl_rl.errors import ConfigError
@@ -147,3 +147,17 @@ def test_arguments_that_no_yaml_file_names_are_reached(typed):
     }
     key, _, value = typed.partition("=")
     assert str(found[key]) == value
+
+
+def test_a_new_target_leaves_the_arguments_of_the_old_one_behind():
+    """But for those that were typed beside it, and for those that it has too."""
+    typed = ["+experiment=drift", "pirl.actor_rule._target_=pirl_rl.actor_rules.Hamiltonian"]
+    config = compose("train", typed)
+    assert config.pirl.actor_rule.steps == 3
+    drop_leftovers(config, typed, [])
+    assert config.pirl.actor_rule == {"_target_": "pirl_rl.actor_rules.Hamiltonian"}
+    typed = ["collocation._target_=pirl_rl.sampling.collocation.ReplayCollocation", "collocation.size=70"]
+    config = compose("train", typed)
+    before = dict(config.collocation)
+    drop_leftovers(config, typed, [])
+    assert dict(config.collocation) == before

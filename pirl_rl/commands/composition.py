@@ -15,7 +15,7 @@ from typing import Any
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
-from omegaconf import MISSING, DictConfig
+from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
 
 from pirl_rl.configuration import CONF, parameters_of, resolve
 
@@ -52,6 +52,29 @@ def register() -> None:
     for path in sorted(CONF.rglob("*.yaml")):
         for target in REFERENCE.findall(path.read_text(encoding="utf-8")):
             store.store(target, arguments(target), group="arguments")
+
+
+def drop_leftovers(config: DictConfig, typed: Sequence[str], trust: Sequence[str]) -> None:
+    """Take out of a node whose `_target_` was typed the arguments of the class that stood there before.
+
+    Args:
+        config: as composed; changed in place.
+        typed: the overrides that were typed.
+        trust: modules outside the package that they name.
+
+    Raises:
+        ConfigError: a target that cannot be loaded.
+    """
+    keys = {text.partition("=")[0].lstrip("+~") for text in typed}
+    for key in (name for name in keys if name.endswith("._target_")):
+        node = OmegaConf.select(config, key.removesuffix("._target_"))
+        parameters = parameters_of(resolve(node._target_, key, trust))
+        if any(entry.kind is entry.VAR_KEYWORD for entry in parameters.values()):
+            continue
+        with open_dict(node):
+            for name in [str(name) for name in node if name != "_target_" and name not in parameters]:
+                if f"{key.removesuffix('_target_')}{name}" not in keys:
+                    del node[name]
 
 
 def compose(name: str, overrides: Sequence[str], with_hydra: bool = False) -> DictConfig:

@@ -16,7 +16,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from pirl_rl.assembly import make_trainer, restore, start_from
-from pirl_rl.commands.composition import register
+from pirl_rl.commands.composition import drop_leftovers, register
 from pirl_rl.commands.console import metrics_table, named_modules, override, quiet_libraries, reported
 from pirl_rl.commands.methods import check_method
 from pirl_rl.configuration import CONF, load_config, save_config
@@ -61,6 +61,7 @@ def train_new(
         # What the user types is trusted; what a directory from elsewhere says is not.
         check_method(config, overrides)
         trust = [*config.trust, *named_modules(overrides), *trust]
+        drop_leftovers(config, overrides, trust)
         trainer = make_trainer(config, folder, trust, problem)
         if config.start is not None:
             # On record as a file wherever one stands: what was typed may be relative, or a run that goes on.

@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from pirl_rl.assembly import make_trainer, start_from
 from pirl_rl.commands.baseline import measure
-from pirl_rl.commands.composition import compose, register
+from pirl_rl.commands.composition import compose, drop_leftovers, register
 from pirl_rl.commands.console import named_modules, quiet_libraries, reported
 from pirl_rl.configuration import CONF, build, convert
 from pirl_rl.errors import INTERRUPTED, ConfigError
@@ -156,6 +156,7 @@ def _first(config: DictConfig, train: Sequence[str], trust: Sequence[str]) -> tu
     if not {"success", "calibration"} <= {*final}:
         raise ConfigError(f"evaluation: expected success and calibration, to judge candidates by, got {final}")
     candidate = compose("train", [*LEADING, *train, *overrides(_example(config, Path(start)), final, config.seed)])
+    drop_leftovers(candidate, train, trust)
     trainer = make_trainer(candidate, None, trust)
     return trainer, start_from(trainer, start), final
 
