@@ -2,8 +2,8 @@
 
     L_critic = sum_i  w_TD L_TD,i + w_HJB L_PDE,i + w_BC L_BC,i                     Eq. (critic_loss)
 
-over the critics i. The derivatives are those of Q(tau, x, u) with u frozen at the target actor's output. The weights
-are buffers: `loss.hjb_weight = 0.3` moves one in place, compiled code included, and a checkpoint keeps it.
+over the critics i. The HJB residual differentiates Q(tau, x, u) with u frozen at the output of the target actor. The
+weights are buffers: `loss.hjb_weight = 0.3` changes one in place, also for compiled code, and a checkpoint keeps it.
 """
 
 from __future__ import annotations
@@ -33,28 +33,35 @@ TD_CRITERIA = {"squares": nn.functional.mse_loss, "cross_entropy": nn.functional
 class PIRLLoss(ScheduledTD3Loss):
     """TD3 targets with collocation HJB and boundary terms.
 
-    `forward` takes a TensorDict with "replay" (transitions, or states without "next" where no TD term is wanted), and
-    where the physics is wanted "collocation" (tau, state, mask) and "boundary" (tau, state, value). It returns
-    "loss_qvalue" and "loss_actor", each named by its optimiser, and the unweighted "td_loss", "hjb_loss",
-    "boundary_loss", summed over the critics.
+    `forward` takes a TensorDict with up to three parts, and each term of the critic loss is there if its part is:
+
+    - "replay": N transitions with "tau" (N, 1), "state" (N, n), "action" (N, m) and, for the TD term, "next";
+    - "collocation": "tau" (N, 1), "state" (N, n) and "mask" (N,), for the HJB term;
+    - "boundary": "tau" (N, 1), "state" (N, n) and "value" (N,), for the boundary term.
+
+    It returns the scalars "loss_qvalue" and "loss_actor", for the two optimisers, and the unweighted "td_loss",
+    "hjb_loss" and "boundary_loss", which are sums over the critics.
 
     Args:
         problem: the physics.
         actor: pi(tau, x).
         critics: two for TD3; one, with `policy_noise=0`, is DDPG's critic rule.
         actor_rule: what the actor ascends, see `pirl_rl.actor_rules`; a stage of training may replace it.
-        td_criterion: "squares" as in the paper, or "cross_entropy" between target and value, which suits probabilities
-            and needs critics in (0, 1).
-        target_critics: the target is the "min" of the critics, as in TD3, or their "mean", which is not biased low.
-        policy_noise: deviation of the target policy's smoothing noise, in [-1, 1] coordinates of the control.
-        noise_clip: bound of that noise.
-        hjb_noise: deviation of the noise on the action of the HJB residual; biases V low, 0 by default.
+        td_criterion: "squares", as in the paper, or "cross_entropy" between target and value, which suits probabilities
+            and needs critics with values in (0, 1).
+        target_critics: the TD target takes the "min" of the critics, as in TD3, or their "mean", which is not biased
+            low.
+        policy_noise: standard deviation of the smoothing noise on the target policy, in [-1, 1] coordinates of the
+            control.
+        noise_clip: bound of the smoothing noise.
+        hjb_noise: standard deviation of the noise on the action of the HJB residual, which biases V low.
         hjb_noise_clip: bound of that noise.
-        hjb_delta: HJB residuals beyond it, 1/s, count linearly (Huber), so that corners where V jumps and no network
-            can follow do not outweigh the rest; None squares all, as in the paper.
-        boundary_delta: the same for the error of V on the boundary.
-        logit_penalty: factor of the mean square of the actor's outputs before their tanh, added to the actor's loss:
-            where tanh saturates, no gradient would bring a wrong action back.
+        hjb_delta: size, in 1/s, beyond which an HJB residual counts linearly (Huber's loss), so that corners where V
+            jumps faster than a network can follow do not outweigh all other points; None squares all residuals, as in
+            the paper.
+        boundary_delta: the same for the error of V on the boundary, without unit.
+        logit_penalty: factor of the mean square of the actor's outputs before their tanh, which is added to the actor's
+            loss: a saturated tanh has no gradient that could correct a wrong action.
         td_weight, hjb_weight, boundary_weight: initial weights of the three terms.
 
     Raises:
@@ -104,7 +111,7 @@ class PIRLLoss(ScheduledTD3Loss):
         own = torch.stack([TensorDict.from_module(module).data.clone() for module in modules])  # type: ignore[union-attr]
         super().__init__(
             TensorDictModule(actor, in_keys=["tau", "state"], out_keys=["action"]),
-            # A list of one would be expanded without parameters; a module alone is re-drawn, hence the copy below.
+            # TorchRL would expand a list of one without parameters, and redraws a single module: hence the copy below.
             modules if len(modules) > 1 else modules[0],  # type: ignore[arg-type]
             bounds=(-one, one),  # type: ignore[arg-type]
             num_qvalue_nets=len(critics),
@@ -125,8 +132,8 @@ class PIRLLoss(ScheduledTD3Loss):
             self.register_coeff_buffer(name, float(value))
 
     def critic_loss(self, batch: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The weighted critic loss and its unweighted parts; each term is there if its part of the batch is."""
-        # TD3Loss draws its smoothing noise first; so do we, for the same stream.
+        """The weighted critic loss, Eq. (critic_loss), and its unweighted terms."""
+        # TD3Loss draws its smoothing noise before anything else; with the same order, both draw the same noise.
         noise = self._clipped_noise(batch["replay", "action"], self.policy_noise, self.noise_clip)
         parts, loss = {}, self.td_weight.new_zeros(())
         if "next" in batch.get("replay").keys():
@@ -141,7 +148,7 @@ class PIRLLoss(ScheduledTD3Loss):
         return loss, {name: part.detach() for name, part in parts.items()}
 
     def actor_loss(self, batch: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The actor's loss by its rule; no gradient reaches the critics."""
+        """The negative objective of the actor rule, plus the logit penalty; no gradient reaches the critics."""
         tau, x = batch["replay", "tau"], batch["replay", "state"]
         loss = torch.zeros((), device=tau.device)
         if self.logit_penalty:
@@ -161,7 +168,7 @@ class PIRLLoss(ScheduledTD3Loss):
         rule.check(self.qvalue_network.module, exploration_noise)  # type: ignore[arg-type]
 
     def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """TD3Loss's name for `critic_loss`."""
+        """`critic_loss`, under the name that `TD3Loss` has for it."""
         return self.critic_loss(tensordict)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -170,7 +177,7 @@ class PIRLLoss(ScheduledTD3Loss):
         return TensorDict({"loss_actor": loss_actor, "loss_qvalue": loss_qvalue, **parts})
 
     def solution(self) -> Solution:
-        """The solution as it stands, on the parameters of this loss: it follows the training."""
+        """The solution on the parameters of this loss: it follows the training."""
         critics = copy.deepcopy(self.qvalue_network)
         self.qvalue_network_params.to_module(critics, preserve_module_state=False)
         return Solution(self.problem, self.actor_network.module, critics.module)  # type: ignore[arg-type]
@@ -188,10 +195,11 @@ class PIRLLoss(ScheduledTD3Loss):
 
     @contextmanager
     def _critics(self, kind: Literal["online", "frozen", "target"] = "online") -> Iterator[Critic]:
-        """The critic module with the stacked parameters of all critics in place, (critics, N, 1) from one call.
+        """The critic module on the stacked parameters of all critics, so that one call gives (critics, N, 1).
 
         Args:
-            kind: "online" parameters take gradients, "frozen" are the same without, "target" the Polyak averages.
+            kind: "online" parameters take gradients, "frozen" ones are the same without gradients, and "target" ones
+                are the Polyak averages.
         """
         if kind == "target":
             params = self.target_qvalue_network_params
@@ -244,7 +252,7 @@ class PIRLLoss(ScheduledTD3Loss):
 
 
 def _huber(residual: Tensor, delta: float | None) -> Tensor:
-    """r^2, or with a delta 2 delta |r| - delta^2 beyond it."""
+    """r^2, and where |r| exceeds a given delta, 2 delta |r| - delta^2."""
     if delta is None:
         return residual.square()
     return 2 * nn.functional.huber_loss(residual, torch.zeros_like(residual), reduction="none", delta=delta)
