@@ -71,9 +71,7 @@ class ReachAvoidProblem(ABC):
             ProblemError: the problem defines no target.
         """
         if type(self).target_level is ReachAvoidProblem.target_level:
-            raise ProblemError(
-                f"{type(self).__name__} needs target_level(x), <= 0 inside the target, got none"
-            )
+            raise ProblemError(f"{type(self).__name__} needs target_level(x), <= 0 inside the target, got none")
         return self.target_level(x).unsqueeze(-1)
 
     def avoid_level(self, x: Tensor) -> Tensor:
