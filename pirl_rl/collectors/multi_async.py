@@ -167,9 +167,7 @@ class MultiAsyncCollector:
         if delivered != self._delivered:
             self._delivered, self._delivered_at = delivered, now
         elif now - self._delivered_at > self.patience:
-            raise CollectorError(
-                f"{len(processes)} rollout workers: expected transitions, they delivered nothing for {self.patience:.0f} s"
-            )
+            raise CollectorError(f"{len(processes)} rollout workers delivered nothing for {self.patience:.0f} s")
 
 
 class _WatchedLock:
