@@ -1,7 +1,7 @@
-"""Checkpoints: `last.pt` holds everything a run needs to go on, `weights-<update>.pt` the loss module alone.
+"""Checkpoints: `last.pt` has everything that resuming a run needs, `weights-<update>.pt` the loss module alone.
 
-A killed run never leaves a broken one. They hold tensors and plain values only and are read with `weights_only=True`,
-so that a foreign file runs no code.
+They are written atomically, so that a killed run leaves no broken file. They contain only tensors and plain values and
+are read with `weights_only=True`, so that loading an untrusted file runs no code.
 """
 
 from __future__ import annotations
@@ -17,42 +17,42 @@ from pirl_rl.errors import ArgumentError, CheckpointError
 from pirl_rl.files import replacing
 
 TARGET = "target_"
-"""Prefix of the names of the target networks' parameters, which may be missing where nothing is trained further."""
+"""Prefix of the names of the target networks' parameters, which a checkpoint for inference alone may lack."""
 
 
 def save(state: dict[str, Any], path: Path) -> None:
-    """Write a state atomically."""
+    """Write a state, a dictionary of tensors and plain values, atomically."""
     with replacing(path, binary=True) as file:
         torch.save(state, file)
 
 
 def load(path: Path) -> dict[str, Any]:
-    """Read a state, to the CPU: its users move it where they are.
+    """Read a state; its tensors are on the CPU.
 
     Raises:
-        CheckpointError: with the file and the reason.
+        CheckpointError: the file is missing, or is not a checkpoint of this package.
     """
     if not path.is_file():
         raise CheckpointError(f"no checkpoint at {path}")
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # a foreign file may be wrong in any way
+    except Exception as error:  # the exception depends on what the file contains
         reason = str(error).partition("\n")[0].partition(". ")[0] or type(error).__name__
-        raise CheckpointError(f"{path} is not a checkpoint of tensors and plain values: {reason}") from None
+        raise CheckpointError(f"{path} is not a checkpoint, expected tensors and plain values: {reason}") from None
     if not isinstance(state, dict) or not isinstance(loss := state.get("learner", state), dict) or "loss" not in loss:
-        raise CheckpointError(f"{path} is not a checkpoint of pirl_rl: it holds no loss module")
+        raise CheckpointError(f"{path} is not a checkpoint of pirl_rl: it has no loss module")
     return state
 
 
 def loss_state(state: dict[str, Any]) -> dict[str, Any]:
-    """The loss module's state; the networks themselves stand for targets that are missing."""
+    """The state of the loss module in a checkpoint; missing target networks are copies of the networks."""
     loss = state.get("learner", state)["loss"]
     own = {name: entry for name, entry in loss.items() if "network_params" in name and not name.startswith(TARGET)}
     return {f"{TARGET}{name}": entry for name, entry in own.items()} | loss
 
 
 def network_states(state: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The entries of the actor and of the stacked critics in a checkpoint, named as in their modules."""
+    """The states of the actor and of the stacked critics in a checkpoint, with the names that their modules use."""
     loss = state.get("learner", state)["loss"]
     prefixes = ("actor_network_params.module.", "qvalue_network_params.module.")
     actor, critics = (
@@ -63,28 +63,34 @@ def network_states(state: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any
 
 
 def check_module(state: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
-    """Refuse networks of other names or shapes; targets that the module does not have are left out by it.
+    """Refuse networks whose entries have other names or shapes than the module's.
 
     Args:
-        state: of the checkpoint.
-        expected: the module's own state.
+        state: the state in the checkpoint; it may have target networks that the module does not have.
+        expected: the state of the module.
 
     Raises:
-        ArgumentError: naming the first entry that is missing, too many, or of another shape.
+        ArgumentError: an entry is missing, unexpected, or of another shape; the message names the first one.
     """
     check_entries(state, expected, "loss")
     for name in state.keys() - expected.keys():
         if not name.startswith(TARGET):
-            raise ArgumentError(f"loss.{name}: expected no such entry")
+            raise ArgumentError(f"loss.{name}: expected no such entry, got one")
 
 
 def check_entries(state: Any, expected: Any, key: str = "") -> None:
-    """Refuse a state that lacks an entry of the expected one, or has a tensor of another shape; it may hold more.
+    """Refuse a state that lacks an entry of the expected state, or has a tensor of another shape there.
 
-    States of random generators depend on their device and are not compared.
+    Further entries are allowed. The states of random generators are not compared, because their sizes depend on the
+    device.
+
+    Args:
+        state: the state in the checkpoint, or a part of it.
+        expected: the state that it must match, or the same part of it.
+        key: the name of that part, for messages.
 
     Raises:
-        ArgumentError: naming the first such entry.
+        ArgumentError: an entry is missing or of another type or shape; the message names the first one.
     """
     if key.endswith("rng"):
         return
@@ -94,8 +100,8 @@ def check_entries(state: Any, expected: Any, key: str = "") -> None:
         for name, entry in expected.items():
             if name not in state:
                 raise ArgumentError(
-                    f"no entry {f'{key}.{name}'.lstrip('.')}; a file of checkpoints/weights-* holds networks alone and "
-                    "may still do"
+                    f"no entry {f'{key}.{name}'.lstrip('.')}, expected one; to take over the networks alone, start "
+                    "from a file checkpoints/weights-*.pt"
                 )
             check_entries(state[name], entry, f"{key}.{name}".lstrip("."))
     elif isinstance(expected, list):
@@ -111,9 +117,9 @@ def check_entries(state: Any, expected: Any, key: str = "") -> None:
 
 
 def restore_rng(rng: torch.Generator, state: torch.Tensor) -> None:
-    """Put a random generator back where it was.
+    """Restore the state of a random generator.
 
-    A generator of another kind of device has other states: there it is seeded from the saved state.
+    The state of a generator on another kind of device has another size; `rng` is then seeded from a checksum of it.
     """
     if len(state) == len(rng.get_state()):
         rng.set_state(state)

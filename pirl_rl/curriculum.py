@@ -1,4 +1,4 @@
-"""A curriculum: stages of training, each with its own starts of episodes, loss weights, collocation and actor rule."""
+"""Curricula: a list of stages of training, each with its own initial states, loss weights, samplers and actor rule."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pirl_rl.schedules import Schedule, Weights
 
 @dataclass(frozen=True, eq=False)
 class StageSettings:
-    """What a stage may set beside the loss weights; see `Stage`."""
+    """The settings in force during a stage, apart from the loss weights; see `Stage` for their meanings."""
 
     initial_states: InitialStates
     collocation: Collocation
@@ -31,23 +31,23 @@ class StageSettings:
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """One stage; what is None stays as the run has it.
+    """One stage of training. Attributes that are None take the settings of the run.
 
     Attributes:
-        share: its length relative to the other stages; together they fill the run.
-        schedule: loss weights over the stage, whose updates it counts from 0.
-        initial_states: law of the starts of episodes.
-        collocation: sampler of the interior points.
-        n_steps: length of returns, in control steps.
-        actor_every: critic updates for each update of the actor and the targets.
-        actor_rule: what the actor ascends.
-        exploration_noise: standard deviation of the noise on played actions; where it changes, the replay buffer is
-            emptied, since its actions are those of another policy.
-        learning_rate: a rate of its own, which decays over the stage as the run's does over the run.
-        train_actor: False keeps the actor as it is, so that the critics learn the value of one fixed policy.
+        share: the length of the stage relative to those of the other stages, which together fill the run.
+        schedule: the loss weights; it counts updates from the start of the stage.
+        initial_states: the distribution of the initial states of episodes.
+        collocation: the sampler of the interior points.
+        n_steps: the length of returns, in control steps.
+        actor_every: the number of critic updates for each update of the actor and the target networks.
+        actor_rule: the objective that the actor ascends.
+        exploration_noise: standard deviation of the noise on played actions, which are normalised to [-1, 1]. Where it
+            changes, the replay buffer is emptied, since its actions come from another policy.
+        learning_rate: the initial learning rate; it decays over the stage. That of the run decays over the run.
+        train_actor: False freezes the actor, so that the critics learn the value of one fixed policy.
 
     Raises:
-        ArgumentError: a number out of range.
+        ArgumentError: a number is out of range.
     """
 
     share: float = 1.0
@@ -74,7 +74,7 @@ class Stage:
             raise ArgumentError(f"stage.learning_rate: expected a number > 0, got {self.learning_rate}")
 
     def over(self, run: StageSettings) -> StageSettings:
-        """This stage's settings, the run's where it has none."""
+        """The settings of this stage, completed by those of the run."""
         own = {field.name: getattr(self, field.name) for field in fields(StageSettings)}
         return replace(run, **{name: value for name, value in own.items() if value is not None})
 
@@ -83,12 +83,12 @@ class Curriculum:
     """Stages one after another over the updates of a run.
 
     Args:
-        schedule: loss weights over the run, for stages without a schedule of their own.
-        updates: length of the run.
-        stages: at least one.
+        schedule: the loss weights over the run, for stages without a schedule.
+        updates: the number of updates of the run.
+        stages: at least one stage.
 
     Raises:
-        ArgumentError: no stage.
+        ArgumentError: there is no stage.
     """
 
     def __init__(self, schedule: Schedule, updates: int, stages: Sequence[Stage] = (Stage(),)):
@@ -97,11 +97,11 @@ class Curriculum:
         self.schedule, self.stages, self.updates = schedule, tuple(stages), updates
         before = [0.0, *accumulate(stage.share for stage in stages)]
         stretch = updates / before.pop()
-        # Rounding of the stretch must not shift a stage by one update.
+        # The tolerance keeps rounding errors of the product from shifting a stage by one update.
         self._firsts = [math.ceil(share * stretch - 1e-6) for share in before]
 
     def index(self, update: int) -> int:
-        """Which stage an update belongs to; the last stage has no end."""
+        """The index of the stage of an update, counted from 0; the last stage has no end."""
         return bisect_right(self._firsts, update) - 1
 
     def is_first(self, update: int) -> bool:
@@ -113,7 +113,7 @@ class Curriculum:
         return self.stages[self.index(update)]
 
     def weights(self, update: int) -> Weights:
-        """(w_TD, w_HJB, w_BC) in force at an update."""
+        """The weights (w_TD, w_HJB, w_BC) at an update."""
         schedule, count, length = self._schedule(update)
         return schedule(count, length)
 
@@ -124,25 +124,25 @@ class Curriculum:
         return max(td), max(hjb), max(boundary)
 
     def progress(self, update: int) -> float:
-        """How far the schedule in force has come at an update, in [0, 1]."""
+        """The progress eta, in [0, 1], of the schedule that is in force at an update."""
         schedule, count, length = self._schedule(update)
         return schedule.progress(count, length)
 
     def decay(self, update: int) -> float:
-        """How far the learning rate's decay has come: a fraction of the run, or of a stage with a rate of its own."""
+        """The progress, in [0, 1], of the learning rate's decay: over the run, or over a stage that sets a rate."""
         if self.stage(update).learning_rate is None:
             return update / self.updates
         first, end = self._bounds(update)
         return (update - first) / (end - first)
 
     def _bounds(self, update: int) -> tuple[int, int]:
-        """First update of an update's stage, and the first one after the stage."""
+        """The first update of the stage of an update, and the first update after that stage."""
         index = self.index(update)
         first, end = [*self._firsts, self.updates][index : index + 2]
         return first, end
 
     def _schedule(self, update: int) -> tuple[Schedule, int, int]:
-        """The schedule in force, the update in its count, and its length."""
+        """The schedule in force at an update, the update as the schedule counts it, and the length of the schedule."""
         own = self.stage(update).schedule
         if own is None:
             return self.schedule, update, self.updates

@@ -1,9 +1,14 @@
-"""Reach-avoid problems as TorchRL environments: the additive-reward problem of the paper's Proposition 1.
+"""Reach-avoid problems as TorchRL environments, with the additive reward of Proposition 1 of the paper.
 
-A batch of paths in one TensorDict: "tau" (*, 1), the time to go, is part of the state; "state" (*, n) in SI units;
-"action" (*, m) is the control in [-1, 1] coordinates; "is_init" (*, 1) marks an episode's first state. A and B absorb,
-so every end, the horizon's too, is a `terminated`. The reward is l_eps of the last state: 1 on success, else 0 with the
-hard payoff.
+A TensorDict contains a batch of N paths:
+
+- "tau" (N, 1): the time to go, in s, which is a part of the state;
+- "state" (N, n): the state x, in SI units;
+- "action" (N, m): the control, normalised to [-1, 1];
+- "is_init" (N, 1): whether the state is the first of its episode;
+- "reward" (N, 1): l_eps at the last state of an episode, else 0.
+
+A and B absorb, and the horizon is a part of the problem, so that every end of an episode is a `terminated`.
 """
 
 from __future__ import annotations
@@ -27,17 +32,17 @@ class ReachAvoidEnv(EnvBase):
 
     Args:
         problem: the physics.
-        dt: control step, s.
-        substeps: integration steps in it.
+        dt: the length of a control step, in s.
+        substeps: the number of integration steps in a control step.
         crossing: "bridge" or "endpoint", see `pirl_rl.simulator`.
-        initial_states: the law of episodes' starts.
-        num_envs: batch size.
-        seed: of the environment's own random generator; drawn from torch's where None.
-        device: of all tensors.
+        initial_states: the distribution of the initial states of episodes; default `UniformStates`.
+        num_envs: the number of paths N.
+        seed: the seed of the random generator; None draws one from torch's default generator.
+        device: the device of all tensors.
 
     Raises:
-        ProblemError: a problem that contradicts itself, e.g. sets that overlap.
-        ValueError: step sizes out of range.
+        ProblemError: the problem contradicts itself, see `check_problem`.
+        ArgumentError: a step size or `num_envs` is out of range, or `crossing` is unknown.
     """
 
     _supports_set_state = True
@@ -66,7 +71,7 @@ class ReachAvoidEnv(EnvBase):
         self.set_seed(int(torch.empty((), dtype=torch.int64).random_().item()) if seed is None else seed)
 
     def recipe(self, seed: int) -> Callable[[], ReachAvoidEnv]:
-        """A picklable call that builds this environment again, with another seed, on the CPU."""
+        """A picklable function that builds a copy of this environment on the CPU, with the given seed."""
         steps = {name: getattr(self.simulator, name) for name in ("dt", "substeps", "crossing")}
         envs = self.batch_size[0]
         return partial(
@@ -110,7 +115,7 @@ class ReachAvoidEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         tau, dt = tensordict["tau"], self.simulator.dt
-        # Whole steps to go are recovered from tau, so that rounding never adds or drops a step.
+        # Rounding to whole steps to go keeps the errors of tau from adding or dropping a step.
         steps = torch.round(tau / dt) - 1
         u = self.problem.controls.denormalize(tensordict["action"])
         step = self.simulator.step(tensordict["state"], u, self.rng)

@@ -1,49 +1,53 @@
-"""Errors that are the user's to mend: their message says what was expected and what was got, and needs no traceback."""
+"""Errors that a user can correct: the message says what was expected and what was got, so no traceback is shown."""
 
 from __future__ import annotations
 
 INTERRUPTED = 130
-"""Exit code of a command that was interrupted and can go on, as shells have it: 128 and the number of SIGINT."""
+"""Exit code of a command that was interrupted and can be resumed: 128 plus the number of SIGINT, as in shells."""
 
 
 class PirlError(Exception):
-    """Base of every error that this package raises on purpose."""
+    """The base class of all errors of this package."""
 
 
 class ArgumentError(PirlError, ValueError):
-    """An argument that a constructor or a function refuses; the message names it."""
+    """A constructor or a function refuses an argument; the message names it."""
 
 
 class ConfigError(PirlError, ValueError):
-    """A configuration that cannot be built; the message names the key, what was expected and what was got."""
+    """Nothing can be built from a configuration; the message names the key."""
 
 
 class ProblemError(PirlError, ValueError):
-    """A problem that contradicts itself; the message names the part and a point."""
+    """A problem is incomplete or contradicts itself; the message names the part."""
 
 
 class CheckpointError(PirlError, RuntimeError):
-    """A checkpoint that is missing, broken or of another configuration; the message names the file."""
+    """A checkpoint is missing, broken or of another configuration; the message names the file."""
 
 
 class CollectorError(PirlError, RuntimeError):
-    """A rollout worker died or delivered nothing; the message names it."""
+    """A rollout worker did not start, died or delivered nothing; the message says which."""
 
 
 class DivergenceError(PirlError, RuntimeError):
-    """A loss became NaN, infinite or exploded; the message names the update and the term."""
+    """A loss or a parameter became NaN or infinite, or a loss exploded; the message names the update and the term."""
 
 
 class CollapseError(DivergenceError):
-    """An evaluation fell below the baseline by more than noise; the message names the metrics, before and after."""
+    """An evaluation fell below the baseline by more than its noise; the message gives the metrics before and after."""
 
 
 class RunError(PirlError, ValueError):
-    """Run directories that cannot be read or compared; the message names the path."""
+    """A run directory cannot be read or compared; the message names the path."""
 
 
 class PlanError(PirlError, ValueError):
-    """An advisor's answer that is no valid plan; `errors` holds the reasons, one line each."""
+    """The answer of an advisor is not a valid plan.
+
+    Attributes:
+        errors: the reasons, one line each.
+    """
 
     def __init__(self, errors):
         super().__init__("; ".join(errors))
@@ -51,14 +55,14 @@ class PlanError(PirlError, ValueError):
 
 
 class AdvisorError(PirlError, RuntimeError):
-    """An advisor gave no answer; the message says why and holds no key."""
+    """An advisor gave no answer; the message says why and contains no API key."""
 
 
 class Interrupted(PirlError):
-    """Training was asked to stop; everything is saved.
+    """A user stopped training, whose state is saved.
 
     Attributes:
-        update: the last update that was made.
+        update: the number of updates that were made.
     """
 
     def __init__(self, update: int):

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Writing files atomically: a reader finds the complete file or none."""
 
 from __future__ import annotations
 
@@ -11,9 +11,17 @@ from typing import IO, Any
 
 @contextmanager
 def replacing(path: Path, binary: bool = False) -> Iterator[IO[Any]]:
-    """A file to write that takes its place, flushed to disk, at the end of the block; a killed one stays a draft.
+    """Open a draft for writing, and put it in the place of `path` at the end of the block, flushed to disk.
 
-    The draft is always a new file: a link left under its name in a foreign directory is not followed.
+    If the block raises, the draft is removed and the file at `path` stays as it was. The draft is always a new file, so
+    that a symbolic link under its name is not followed.
+
+    Args:
+        path: the file to write; missing directories are made.
+        binary: whether bytes are written, in place of UTF-8 text.
+
+    Raises:
+        OSError: the file cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f".{path.name}.draft")

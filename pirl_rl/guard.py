@@ -1,4 +1,4 @@
-"""The guard: notices in the evaluations of a run that training has collapsed, and brings back what it had learned."""
+"""Detection of a collapse of training in its evaluations, and the rollback to the last good networks."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ RATES = ("success_rate", "reward")
 SPREAD = "value_spread"
 
 LEAST_SPREAD = 0.2
-"""A spread of V below this is no baseline: untrained networks have as much by chance."""
-
+"""A smaller standard deviation of V is no baseline, because untrained networks may have it by chance."""
 
 GOOD = 2.0
-"""Deviations below the baseline within which an evaluation is as good: 19 of 20 that truly are fall into it."""
+"""An evaluation is good if it is at most this many standard deviations below the baseline; of equally good policies,
+about 19 in 20 evaluations are."""
 
 
 class Guard:
-    """Compares evaluations with the baseline: the first one, and afterwards the one of the highest success rate.
+    """Compares evaluations with a baseline: the evaluation with the highest success rate, at first the first one.
 
-    The success rate or the reward has collapsed where it is below the baseline by more than `sigmas` deviations of the
-    difference of two such means, and by more than `tolerance` of the baseline, as training moves them by a few per
-    cent from one evaluation to the next. The deviation is that of binomial rates of independent episodes: an upper
-    bound, since payoffs in [0, 1] vary no more and all evaluations share their starts. For the same reason the spread
-    of V has no such noise.
+    The success rate or the reward has collapsed if it is below the baseline by more than `sigmas` standard deviations
+    of the difference of the two estimates and by more than the share `tolerance` of the baseline, since training moves
+    both by a few per cent between evaluations. The standard deviation is that of binomial rates of independent
+    episodes. It is an upper bound, because payoffs in [0, 1] have no larger variance and all evaluations start from the
+    same states. V at these states has no sampling noise, so its spread is compared without one.
 
     Args:
-        episodes: of each evaluation.
-        sigmas: deviations that count as noise.
-        tolerance: relative loss of a rate that is no collapse.
-        spread: part of the baseline's standard deviation of V over the starts below which V has collapsed.
+        episodes: the number of episodes of each evaluation.
+        sigmas: the number of standard deviations that count as noise.
+        tolerance: the relative loss of a rate that is not a collapse.
+        spread: V has collapsed if its standard deviation over the initial states is below this share of the baseline's.
     """
 
     def __init__(self, episodes: int, sigmas: float = 4.0, tolerance: float = 0.2, spread: float = 0.5):
@@ -44,44 +44,52 @@ class Guard:
         self.baseline: dict[str, float] = {}
 
     def judge(self, metrics: Mapping[str, float]) -> bool:
-        """Whether success and reward are those of the baseline, but for `GOOD` deviations, or better.
+        """Whether success rate and reward are at most `GOOD` standard deviations below the baseline.
+
+        Args:
+            metrics: the metrics of an evaluation; "success_rate", "reward" and "value_spread" are read.
 
         Raises:
-            CollapseError: they, or the spread of V, collapsed; a metric that is NaN did.
+            CollapseError: the success rate, the reward or the spread of V has collapsed or is NaN.
         """
-        now = {name: metrics[name] for name in (*RATES, SPREAD)}
+        current = {name: metrics[name] for name in (*RATES, SPREAD)}
         if not self.baseline:
-            self.baseline = now
+            self.baseline = current
             return True
-        lost = {name: self.baseline[name] - now[name] for name in RATES}
-        deviation = {name: self._deviation(name, now) for name in RATES}
+        lost = {name: self.baseline[name] - current[name] for name in RATES}
+        deviation = {name: self._standard_deviation(name, current) for name in RATES}
         fallen = [
             name
             for name in RATES
             if not lost[name] <= max(self.sigmas * deviation[name], self.tolerance * self.baseline[name])
         ]
         spread = self.baseline[SPREAD]
-        if spread >= LEAST_SPREAD and not now[SPREAD] >= self.spread * spread:
+        if spread >= LEAST_SPREAD and not current[SPREAD] >= self.spread * spread:
             fallen.append(SPREAD)
         if fallen:
             raise CollapseError(
-                ", ".join(f"{name} from {self.baseline[name]:.3g} to {now[name]:.3g}" for name in fallen)
+                ", ".join(f"{name} from {self.baseline[name]:.3g} to {current[name]:.3g}" for name in fallen)
             )
-        if now["success_rate"] > self.baseline["success_rate"]:
-            self.baseline = now
+        if current["success_rate"] > self.baseline["success_rate"]:
+            self.baseline = current
         return all(lost[name] <= GOOD * deviation[name] for name in RATES)
 
-    def _deviation(self, name: str, now: Mapping[str, float]) -> float:
-        pooled = (self.baseline[name] + now[name]) / 2
+    def _standard_deviation(self, name: str, current: Mapping[str, float]) -> float:
+        pooled = (self.baseline[name] + current[name]) / 2
         return math.sqrt(2 * max(pooled * (1 - pooled), 0.0) / self.episodes)
 
 
 class Rollback:
-    """Keeps what a learner was at its last good evaluation, one within noise of the best, and brings it back.
+    """Keeps the state of a learner at its last good evaluation, and restores it after a collapse.
+
+    Args:
+        learner: the learner.
+        success: the evaluator whose metrics are judged.
+        simulator: simulates the episodes of the evaluator.
 
     Attributes:
-        good_at: the update of what is kept; None before the first evaluation.
-        collapsed_at: the update after which a collapse was noticed; None without one.
+        good_at: the update after which the state was kept; None before the first evaluation.
+        collapsed_at: the update after which a collapse was detected; None without one.
     """
 
     def __init__(self, learner: Learner, success: Success, simulator: Simulator):
@@ -109,25 +117,29 @@ class Rollback:
         return cls(learner, success, simulator)
 
     def judge(self, update: int, row: Mapping[str, float] | None = None) -> None:
-        """Look at the networks after an update, through the row's metrics where it has them.
+        """Judge the networks after an update, and keep the state of the learner if they are good.
+
+        Args:
+            update: the number of updates made.
+            row: the metrics of that update; without a success rate among them, the networks are evaluated.
 
         Raises:
-            CollapseError: see `Guard`.
+            CollapseError: training has collapsed, see `Guard`.
         """
         metrics = row
         if not metrics or "success_rate" not in metrics:
             metrics = self.success(self.learner.loss.solution(), self.simulator).metrics()
         if self.guard.judge(metrics):
-            # With the optimisers: those of a collapse would spoil what starts from here.
+            # The optimisers are kept too, because their moments after a collapse would harm further training.
             self.good, self.good_at = copy.deepcopy(self.learner.state_dict()), update
 
     def restore(self, update: int) -> None:
-        """Put the learner back, after a collapse noticed at an update."""
+        """Restore the state that was kept, after a collapse that was detected at an update."""
         self.learner.load_state_dict(self.good)
         self.collapsed_at = update
 
     def summary(self) -> dict[str, int]:
-        """Updates of the collapse and of what was put back; empty without a collapse."""
+        """The updates of the collapse and of the state that was restored; empty without a collapse."""
         if self.collapsed_at is None or self.good_at is None:
             return {}
         return {"collapsed_at": self.collapsed_at, "rolled_back_to": self.good_at}

@@ -1,4 +1,4 @@
-"""Private names of torch and TorchRL that this package relies on, in one place: a new version is checked against it."""
+"""The private names of torch and TorchRL on which this package relies; check them when a version changes."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ __all__ = [
 
 
 class ScheduledTD3Loss(TD3Loss):
-    """TD3's loss with buffers for the weights of the critic loss: an assignment moves a weight in place."""
+    """TD3's loss with the weights of the critic loss as buffers, which an assignment changes in place."""
 
     _schedulable_buffers = frozenset(WEIGHTS)
 
 
 def carried(collector: Collector) -> TensorDictBase:
-    """The TensorDict that a collector carries from one step to the next, with the state of all environments."""
+    """The TensorDict that a collector keeps between steps, with the states of all environments."""
     return collector._carrier
 
 
 def plays_at_random(collector: Collector) -> bool:
-    """Whether the next batch of a collector still belongs to its random warm-up."""
+    """Whether the next batch of a collector belongs to its warm-up with random actions."""
     return collector._should_use_random_frames()
 
 
 def write_lock(buffer: TensorDictReplayBuffer) -> Any:
-    """The lock between processes under which a shared buffer is written and sampled."""
+    """The lock between processes that is held while a shared buffer is written or sampled."""
     return buffer._write_lock
 
 
 def lock_writes_with(buffer: TensorDictReplayBuffer, lock: Any) -> None:
-    """Let another lock, or a wrapper of its own, take the place of a shared buffer's."""
+    """Replace the lock of a shared buffer."""
     buffer._write_lock = lock

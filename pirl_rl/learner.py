@@ -1,4 +1,4 @@
-"""The learner: one update of critics, actor and targets, Algorithm 1 of the paper, lines 7 to 13."""
+"""One update of the critics, the actor and the target networks: Algorithm 1 of the paper, lines 7 to 13."""
 
 from __future__ import annotations
 
@@ -19,24 +19,26 @@ from pirl_rl.losses import PIRLLoss
 from pirl_rl.schedules import WEIGHTS, Weights
 
 EXPLOSION = 1e6
-"""A critic loss above this is a divergence: probabilities err by at most 1, and residuals of interest are far below."""
+"""A loss above this is a divergence. Errors of probabilities are at most 1, and useful residuals are far smaller."""
 
 LossFunction = Callable[[TensorDictBase], tuple[Tensor, dict[str, Tensor]]]
 
 
 class Learner:
-    """Optimises a loss.
+    """Updates the networks of a loss with Adam.
 
     Args:
-        loss: critics, actor and their targets.
-        learning_rate: Adam's rate at the first update, for critics and actor.
-        decay: "cosine" lets the rate fall to zero along a quarter wave, "constant" keeps it.
-        actor_every: critic updates for each update of the actor and the targets (d_up).
-        polyak: rate of the targets.
-        compile: compile the losses; where that fails, as without a C++ compiler, they run eagerly after one warning.
+        loss: the loss, with the critics, the actor and their target networks.
+        learning_rate: Adam's initial learning rate, for the critics and the actor.
+        decay: "cosine" lowers the learning rate to 0 by (1 + cos(pi t)) / 2 for t from 0 to 1, "constant" keeps it.
+        actor_every: the number of critic updates for each update of the actor and the target networks, d_up in the
+            paper.
+        polyak: the rate, in (0, 1], at which the target networks follow the networks.
+        compile: whether the losses are compiled. Where that fails, as without a C++ compiler, they run eagerly after
+            one warning.
 
     Raises:
-        ArgumentError: a number out of range, an unknown decay.
+        ArgumentError: a number is out of range, or `decay` is unknown.
     """
 
     def __init__(
@@ -68,11 +70,11 @@ class Learner:
         self._compile_actor_loss()
 
     def apply(self, settings: StageSettings) -> None:
-        """Continue with the settings of a stage."""
+        """Continue with the settings of a stage; a change of the actor rule resets the optimiser of the actor."""
         self.actor_every, self.train_actor = settings.actor_every, settings.train_actor
         self.learning_rate = settings.learning_rate
         if _name(settings.actor_rule) != self._moments_rule:
-            # Adam's moments of one objective are the wrong scale for another's first steps.
+            # Adam's moments have the scale of one objective's gradient and would misscale steps along another's.
             self.actor_optimizer.state.clear()
             self._moments_rule = _name(settings.actor_rule)
         if settings.actor_rule is not self.loss.actor_rule:
@@ -80,18 +82,21 @@ class Learner:
             self._compile_actor_loss()
 
     def update(self, batch: TensorDictBase, k: int, weights: Weights, decay: float) -> dict[str, Tensor]:
-        """The k-th update (from 0) on {"replay", "collocation", "boundary"}; returns the unweighted terms.
-
-        "loss_actor" is that of the actor's last update.
+        """Make one update.
 
         Args:
-            batch: TensorDict on the device of the networks.
-            k: decides whether the actor and the targets are updated too.
+            batch: a TensorDict with "replay", "collocation" and "boundary", see `PIRLLoss`, on the device of the
+                networks.
+            k: the number of the update, counted from 0; the actor and the target networks are updated if it is a
+                multiple of `actor_every`.
             weights: (w_TD, w_HJB, w_BC) of the critic loss.
-            decay: how far the decay of the learning rate has come, from 0 to 1.
+            decay: the progress of the decay of the learning rate, in [0, 1].
+
+        Returns:
+            The unweighted terms of the critic loss, and "loss_actor" of the actor's last update.
 
         Raises:
-            DivergenceError: before the step that would have spoilt the networks.
+            DivergenceError: a loss is not finite or too large; the networks are as before the step that it would make.
         """
         for name, value in zip(WEIGHTS, weights, strict=True):
             setattr(self.loss, name, value)
@@ -110,19 +115,19 @@ class Learner:
         return {**terms, "loss_actor": self._loss_actor}
 
     def rate(self, decay: float) -> float:
-        """The learning rate once its decay has come this far, from 0 to 1."""
+        """The learning rate at a progress of its decay in [0, 1]."""
         fraction = 1.0 if self.decay == "constant" else (1 + math.cos(math.pi * min(decay, 1.0))) / 2
         return self.learning_rate * fraction
 
     def check_parameters(self, update: int) -> None:
-        """Refuse networks that are spoilt already: a finite loss may have had a gradient that is not.
+        """Refuse parameters that are not finite: a finite loss may have had an infinite gradient.
 
         Raises:
-            DivergenceError: with the update and the parameter.
+            DivergenceError: a parameter is not finite; the message names it and the update.
         """
         for name, parameter in self.loss.named_parameters():
             if not parameter.isfinite().all():
-                raise DivergenceError(f"update {update}: {name} is not finite")
+                raise DivergenceError(f"update {update}: the parameter {name} is not finite")
 
     def state_dict(self) -> dict[str, Any]:
         return {
@@ -139,7 +144,7 @@ class Learner:
         self.critic_optimizer.load_state_dict(state["critic_optimizer"])
         self.actor_optimizer.load_state_dict(state["actor_optimizer"])
 
-    # What is compiled is decided in the next two methods and kept in `_critic_loss`, `_actor_loss` and the rule.
+    # The next two methods decide what is compiled, and keep it in `_critic_loss`, `_actor_loss` and the actor rule.
 
     def _compile_critic_loss(self) -> None:
         self._critic_loss: LossFunction = self._compiler()(self.loss.critic_loss)
@@ -153,7 +158,7 @@ class Learner:
         return torch.compile if self.compile else lambda function: function
 
     def _evaluated(self, which: Literal["critic", "actor"], batch: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """A loss, compiled where that works."""
+        """A loss and its terms; if compilation fails, the losses run eagerly from then on."""
 
         def evaluate() -> tuple[Tensor, dict[str, Tensor]]:
             return (self._critic_loss if which == "critic" else self._actor_loss)(batch)
@@ -182,7 +187,7 @@ class Learner:
             return
         found = ", ".join(f"{name} = {term.item():.3g}" for name, term in terms.items())
         worst = max(terms, key=lambda name: math.inf if math.isnan(value := terms[name].item()) else abs(value))
-        raise DivergenceError(f"update {update}: {worst} is not finite or exploded (above {EXPLOSION:.0e}): {found}")
+        raise DivergenceError(f"update {update}: {worst} is not finite or above {EXPLOSION:.0e}: {found}")
 
 
 def _adam(params, rate: float) -> torch.optim.Adam:
@@ -190,5 +195,5 @@ def _adam(params, rate: float) -> torch.optim.Adam:
 
 
 def _name(rule: object) -> str:
-    """The class of a rule, as a checkpoint keeps it."""
+    """The full name of the class of a rule, by which a checkpoint records it."""
     return f"{type(rule).__module__}.{type(rule).__qualname__}"

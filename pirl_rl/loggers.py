@@ -1,4 +1,4 @@
-"""Loggers: where the rows of metrics go. `metrics.csv` is what figures, comparisons and resuming read."""
+"""Loggers, which record rows of metrics. Figures, comparisons and resuming read `metrics.csv`."""
 
 from __future__ import annotations
 
@@ -16,21 +16,23 @@ from pirl_rl.run_directory import RunDirectory
 
 
 class MetricsLogger(Protocol):
-    """Takes a row of numbers for an update."""
+    """Records rows of metrics, each with the number of its update."""
 
     def open(self, folder: Path, config: Mapping[str, Any]) -> None:
-        """Begin, or go on, in a run directory."""
+        """Start or continue the record in a run directory; `config` is the configuration of the run."""
 
-    def log(self, row: Mapping[str, float]) -> None: ...
+    def log(self, row: Mapping[str, float]) -> None:
+        """Record a row; its entry "update" is the number of updates made."""
 
     def rewind(self, update: int) -> None:
-        """Forget rows after an update: a resumed run writes them again."""
+        """Remove the rows after an update, because a resumed run writes them again."""
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Finish the record."""
 
 
 class CSVLogger:
-    """One row an update in `metrics.csv`; its columns are those of the first row, cells may stay empty."""
+    """Writes rows to `metrics.csv`. The columns are the entries of the first row; missing entries leave empty cells."""
 
     def open(self, folder: Path, config: Mapping[str, Any]) -> None:
         self.path = RunDirectory(folder).metrics
@@ -52,7 +54,7 @@ class CSVLogger:
         with replacing(self.path) as file:
             writer = csv.DictWriter(file, columns)
             writer.writeheader()
-            # A row cut short by a kill has no update, or one that comes again.
+            # A row that a killed run left incomplete has no update, or one that a resumed run writes again.
             writer.writerows(row for row in rows if (row["update"] or "").isdigit() and int(row["update"]) <= update)
 
     def close(self) -> None:
@@ -67,10 +69,11 @@ class CSVLogger:
 
 
 class TorchRLLogger(CSVLogger):
-    """One of TorchRL's loggers beside `metrics.csv`.
+    """Records metrics with one of TorchRL's loggers and in `metrics.csv`.
 
     Args:
-        kind: "wandb" (offline where neither WANDB_API_KEY nor a netrc entry names an account) or "tensorboard".
+        kind: "tensorboard", or "wandb" for Weights & Biases. Without WANDB_MODE, WANDB_API_KEY and an account in the
+            netrc file, W&B runs offline.
         project: name of the W&B project.
     """
 
@@ -79,7 +82,7 @@ class TorchRLLogger(CSVLogger):
         self.project = project
 
     def open(self, folder: Path, config: Mapping[str, Any]) -> None:
-        # Only here: TorchRL's loggers bring their libraries with them, among them W&B's.
+        # Imported here, because TorchRL's loggers import large libraries such as W&B's.
         from torchrl.record.loggers import get_logger
 
         super().open(folder, config)
@@ -105,7 +108,7 @@ class TorchRLLogger(CSVLogger):
 
 
 class NoLogger:
-    """Keeps nothing; the run has no curves."""
+    """Records nothing."""
 
     def open(self, folder: Path, config: Mapping[str, Any]) -> None:
         pass
@@ -121,10 +124,14 @@ class NoLogger:
 
 
 def read_metrics(path: str | Path) -> dict[str, np.ndarray]:
-    """The columns of a metrics.csv as float arrays (rows,), NaN where a cell is empty.
+    """Read the columns of a `metrics.csv`, by name.
+
+    Returns:
+        Arrays (rows,) of floats, NaN where a cell is empty.
 
     Raises:
-        OSError, ValueError: the file cannot be read, or a cell is no number.
+        OSError: the file cannot be read.
+        ValueError: a cell is not a number.
     """
     with open(path, newline="") as file:
         rows = csv.DictReader(file)

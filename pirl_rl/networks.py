@@ -1,7 +1,7 @@
-"""Actor and critics: plain layer stacks, scaled to [-1, 1] by their first layer.
+"""Actor and critics: multilayer perceptrons whose first layer scales the inputs to [-1, 1].
 
-Every forward broadcasts over leading axes of the parameters: with weights stacked as (critics, out, in), as TorchRL's
-losses hold them, one call evaluates all critics, (critics, N, 1).
+The parameters may have leading axes, over which `forward` broadcasts. With weights stacked as (critics, out, in), as in
+TorchRL's losses, one call evaluates all critics and returns (critics, N, 1).
 """
 
 from __future__ import annotations
@@ -22,14 +22,21 @@ ROOT_TIME_OFFSET = 1e-4
 
 
 class Dense(nn.Linear):
-    """x W^T + b with parameters that may be stacked: weight (*, out, in), bias (*, out), x (*, N, in)."""
+    """x W^T + b (*, N, out) of x (*, N, in); weight (*, out, in) and bias (*, out) may be stacked."""
 
     def forward(self, input: Tensor) -> Tensor:
         return torch.matmul(input, self.weight.mT) + self.bias.unsqueeze(-2)
 
 
 class Scaling(nn.Module):
-    """The affine map of [low, high] to [-1, 1], axis by axis, as a layer: autograd does the chain rule."""
+    """The affine map of the box [low, high] to [-1, 1]^d, for inputs (*, N, d).
+
+    As a layer it needs no scaled copy of the physics: derivatives in physical units follow by the chain rule.
+
+    Args:
+        low: lower corner, d numbers.
+        high: upper corner, d numbers.
+    """
 
     scale: Tensor
     shift: Tensor
@@ -46,10 +53,13 @@ class Scaling(nn.Module):
 
 
 class RootTime(nn.Module):
-    """Appends sqrt(tau + tau_0) to inputs (*, d) whose first entry is the time to go.
+    """Appends sqrt(tau + tau_0) to inputs (*, d) whose first entry is the time to go tau.
 
-    Where data jump at tau = 0, V spreads over a width of sqrt(tau): in the root of time that is a wedge, which a small
-    network can follow into the corner. tau_0 > 0 bounds the slope 1/(2 sqrt(tau + tau_0)) at tau = 0.
+    Where the boundary data jump at tau = 0, V varies over a width proportional to sqrt(tau). As a function of the root
+    of time that is a wedge, which a small network can represent up to tau = 0.
+
+    Args:
+        tau_0: in s, above 0; it bounds the slope 1/(2 sqrt(tau + tau_0)) at tau = 0.
     """
 
     def __init__(self, tau_0: float):
@@ -86,10 +96,10 @@ def _stack(
 
 
 def _activation(argument: str, name: str) -> nn.Module:
-    """The layer of `torch.nn` of that name, without arguments.
+    """The layer of `torch.nn` with this name, made without arguments.
 
     Raises:
-        ArgumentError: there is none.
+        ArgumentError: `torch.nn` has no such layer; the message names `argument`.
     """
     layer = getattr(nn, name, None)
     if not (isinstance(layer, type) and issubclass(layer, nn.Module)):
@@ -105,13 +115,16 @@ def _xavier(layers: nn.Sequential) -> None:
 
 
 class Actor(nn.Module):
-    """pi(tau, x): the normalised control, (*, 1), (*, n) -> (*, m) in [-1, 1].
+    """The policy pi(tau, x): maps tau (N, 1), in s, and x (N, n) to the control (N, m), normalised to [-1, 1].
 
     Args:
-        problem: gives the scaling and the sizes.
+        problem: gives the numbers of states and controls, and the horizon.
         hidden: widths of the hidden layers.
-        activation: name of a module of `torch.nn`.
-        scaling: box of states that the first layer maps to [-1, 1]; default `problem.states`.
+        activation: name of a layer of `torch.nn`.
+        scaling: box of states that the first layer maps to [-1, 1]^n; default `problem.states`.
+
+    Raises:
+        ArgumentError: `activation` is not the name of a layer of `torch.nn`.
     """
 
     def __init__(
@@ -126,7 +139,7 @@ class Actor(nn.Module):
         self.layers = _stack(problem, 0, hidden, problem.controls.dim, activation, "Tanh", root_time=False, box=box)
 
     def logits(self, tau: Tensor, state: Tensor) -> Tensor:
-        """What the control is the hyperbolic tangent of."""
+        """The output (N, m) before the hyperbolic tangent of the last layer."""
         return self.layers[:-1](torch.cat([tau, state], -1))
 
     def forward(self, tau: Tensor, state: Tensor) -> Tensor:
@@ -134,19 +147,21 @@ class Actor(nn.Module):
 
 
 class Critic(nn.Module):
-    """Q(tau, x, u), or V(tau, x): a probability, (*, 1), (*, n), (*, m) -> (*, 1); u normalised.
+    """Q(tau, x, u) or V(tau, x): maps tau (N, 1), in s, x (N, n) and the normalised u (N, m) to a probability (N, 1).
 
     Args:
-        problem: gives the scaling and the sizes.
+        problem: gives the numbers of states and controls, and the horizon.
         hidden: widths of the hidden layers.
-        activation: name of a module of `torch.nn`; C^2 where an HJB residual is taken.
-        action_input: True is Q, as in the paper; its derivatives at a frozen u are those of holding u for ever. False
-            is V: the action is ignored, derivatives are those of the policy's value, and transitions must be played
-            without noise.
+        activation: name of a layer of `torch.nn`; `PIRLLoss` needs a C^2 one.
+        action_input: True makes a critic Q(tau, x, u), as in the paper. False makes a critic V(tau, x), which ignores
+            the action. Its derivatives are those of the value of the policy, so that played actions must have no noise.
         root_time: whether sqrt(tau) is an input beside tau, see `RootTime`.
-        output: "Sigmoid" keeps probabilities in (0, 1), as in the paper, but reaches 0 or 1 at a face only in the limit
-            of infinite weights; None is linear, and meets a face as V does.
-        scaling: box of states that the first layer maps to [-1, 1]; default `problem.states`.
+        output: "Sigmoid" keeps the output in (0, 1), as in the paper, but attains 0 or 1 at a face only in the limit of
+            infinite weights. None is a linear output, which attains both.
+        scaling: box of states that the first layer maps to [-1, 1]^n; default `problem.states`.
+
+    Raises:
+        ArgumentError: `activation` or `output` is not the name of a layer of `torch.nn`.
     """
 
     def __init__(
@@ -166,18 +181,19 @@ class Critic(nn.Module):
         _xavier(self.layers)
 
     def inputs(self, tau: Tensor, state: Tensor, action: Tensor) -> Tensor:
+        """The input (N, d) of the first layer: (tau, x, u), or (tau, x) for a critic V(tau, x)."""
         return torch.cat([tau, state, action] if self.action_input else [tau, state], -1)
 
     def forward(self, tau: Tensor, state: Tensor, action: Tensor) -> Tensor:
         return self.layers(self.inputs(tau, state, action))
 
     def at(self, action: Tensor) -> CriticValue:
-        """V(tau, x) = Q(tau, x, action) with the action (N, m) frozen."""
+        """The function V(tau, x) = Q(tau, x, action) with the action (N, m) frozen."""
         return CriticValue(self, action)
 
 
 def stack(critics: Sequence[Critic]) -> Critic:
-    """One critic whose parameters carry a leading axis over `critics`, as TorchRL's losses hold them."""
+    """One critic whose parameters have a leading axis over `critics`, as in TorchRL's losses."""
     twin = copy.deepcopy(critics[0])
     for layer, *layers in zip(twin.layers, *(critic.layers for critic in critics), strict=True):
         for key in layer._parameters:
@@ -188,7 +204,12 @@ def stack(critics: Sequence[Critic]) -> Critic:
 
 
 class CriticValue:
-    """A critic at a frozen action: V, (N,), (N, n) -> (N,), or (critics, N) with stacked parameters."""
+    """A critic at a frozen action: maps tau (N,) and x (N, n) to V (N,), or (critics, N) with stacked parameters.
+
+    Args:
+        critic: the critic.
+        action: the action (N, m), normalised to [-1, 1].
+    """
 
     def __init__(self, critic: Critic, action: Tensor):
         self.critic, self.action = critic, action

@@ -1,17 +1,17 @@
-"""The generator of the controlled SDE, Eq. (parabolic_operator) of the paper:
+"""The generator of the controlled SDE with the time to go as a part of the state, Eq. (parabolic_operator):
 
     L^u V = -d_tau V + f(x, u) . grad_x V + 1/2 Tr(sigma sigma^T hess_x V).
 
-Fast path. By Ito's lemma, along dX = f dt + sigma dW with the time to go running down, every activation z of a network
-is itself an Ito process dz = a dt + s dW. Starting from the input (tau, x) with drift (-1, f) and one column
-(0, sigma_j) per noise channel, layers carry (z, a, s):
+For the critics of this package it is computed by Ito propagation. Along dX = f dt + sigma dW, d tau = -dt, every
+activation z of a network is an Ito process dz = a dt + s dW by Ito's lemma. The input (tau, x) has the drift
+a = (-1, f) and one column s_j = (0, sigma_j) for each of the w noise channels. The layers map (z, a, s) as follows:
 
-- an affine map acts linearly on a and s and its bias on z alone;
+- an affine layer applies its weights to z, a and s, and its bias to z alone;
 - an activation phi gives (phi(z), phi'(z) a + 1/2 phi''(z) |s|^2, phi'(z) s).
 
-The drift of the output is L^u V: the work of 2 + w forward passes and no graph of derivatives, so one backward pass
-reaches the parameters through the Hessian, and the whole compiles. Any other callable goes through
-forward-mode `torch.func`.
+The drift of the output is L^u V. This costs as much as 2 + w forward passes and builds no graph of derivatives, so that
+it can be compiled and one backward pass gives the gradient in the parameters, through the Hessian too. Other callables
+are differentiated by the forward mode of `torch.func`.
 """
 
 from __future__ import annotations
@@ -56,31 +56,35 @@ ACTIVATIONS: dict[type[nn.Module], Callable[[Tensor], tuple[Tensor, Tensor, Tens
     nn.SiLU: _silu,
     nn.Softplus: _softplus,
 }
-"""phi, phi', phi'' of every activation the fast path knows; all are C^2, as a second-order equation needs."""
+"""phi, phi' and phi'' of the activations that Ito propagation supports; all are C^2, since L^u is of second order."""
 
 
 def generator(value: ValueFunction, problem: ReachAvoidProblem, tau: Tensor, x: Tensor, u: Tensor) -> Tensor:
-    """L^u V at points.
+    """L^u V at points, Eq. (parabolic_operator).
 
     Args:
-        value: V, (N,), (N, n) -> (N,); a critic bound by `critic.at(action)` takes the fast path, with a leading axis
-            where its parameters are stacked.
-        tau: time to go (N,), s.
+        value: V, which maps (N,) and (N, n) to (N,); for `critic.at(action)` it is computed by Ito propagation.
+        problem: gives f and sigma.
+        tau: times to go (N,), in s.
         x: states (N, n).
-        u: physical controls (N, m) of the drift and diffusion; a gradient may flow through them.
+        u: physical controls (N, m), the arguments of f and sigma; the result is differentiable in them.
 
     Returns:
-        (N,), or (critics, N), in 1/s.
+        L^u V (N,), in 1/s, or (critics, N) for a critic with stacked parameters.
     """
     return _along(value, tau, x, problem.drift(x, u), problem.diffusion(x, u))
 
 
 def advection(value: ValueFunction, problem: ReachAvoidProblem, tau: Tensor, x: Tensor, u: Tensor) -> Tensor:
-    """-d_tau V + f(x, u) . grad_x V: all of L^u V that depends on u where the noise does not. As `generator`."""
+    """-d_tau V + f(x, u) . grad_x V; arguments and shapes are those of `generator`.
+
+    If sigma does not depend on u, this differs from L^u V by a term without u.
+    """
     return _along(value, tau, x, problem.drift(x, u), x.new_zeros((*x.shape, 0)))
 
 
 def _along(value: ValueFunction, tau: Tensor, x: Tensor, f: Tensor, sigma: Tensor) -> Tensor:
+    """The drift of V along the SDE with f (N, n) and sigma (N, n, w)."""
     if isinstance(value, CriticValue):
         return _ito_drift(value, tau, x, f, sigma)
     return _forward_mode(value, tau, x, f, sigma)
@@ -97,9 +101,9 @@ def _ito_drift(value: CriticValue, tau: Tensor, x: Tensor, f: Tensor, sigma: Ten
 
 
 def _propagate(layer: nn.Module, z: Tensor, a: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Carry value and drift (*, N, d) and columns (*, w, N, d) through one layer."""
+    """Map the value z (*, N, d), its drift a (*, N, d) and its columns s (*, w, N, d) through one layer."""
     if isinstance(layer, RootTime):
-        # d sqrt(tau + tau_0) = d tau / (2 sqrt(tau + tau_0)), and time has no noise.
+        # d sqrt(tau + tau_0) = d tau / (2 sqrt(tau + tau_0)), and tau has no noise.
         root = layer(z)
         rate = 1 / (2 * root[..., -1:])
         return root, torch.cat([a, a[..., :1] * rate], -1), nn.functional.pad(s, (0, 1))
@@ -125,10 +129,10 @@ def _forward_mode(value: ValueFunction, tau: Tensor, x: Tensor, f: Tensor, sigma
 
 
 def require_twice_differentiable(layers: nn.Sequential) -> None:
-    """Refuse a network whose second derivatives do not exist or are not known to the fast path.
+    """Refuse a network whose second derivatives do not exist or that Ito propagation does not support.
 
     Raises:
-        ArgumentError: naming the layer and the activations that can stand in its place.
+        ArgumentError: an activation is not one of `ACTIVATIONS`.
     """
     for layer in layers:
         if not isinstance(layer, (RootTime, Scaling, Dense)) and type(layer) not in ACTIVATIONS:
@@ -140,5 +144,5 @@ def require_twice_differentiable(layers: nn.Sequential) -> None:
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    """Mean of the values where the mask is true, 0 where it nowhere is; shapes stay fixed, as a compiler likes it."""
+    """The mean of the values (*) where the mask (*) is true, or 0 if it is true nowhere; the shapes are static."""
     return torch.where(mask, values, torch.zeros_like(values)).sum() / mask.sum().clamp(min=1)

@@ -1,9 +1,10 @@
-"""The problem: a controlled SDE, a target set, an avoid set and a horizon. The one copy of the physics.
+"""The problem: a controlled SDE, a target set A, an avoid set B and a horizon T.
 
-    dX = f(X, U) dt + sigma(X, U) dW,   X in R^n, U in a box of R^m, W in R^w,
+    dX = f(X, U) dt + sigma(X, U) dW,   X in R^n, U in a box of R^m, W in R^w      Eq. (sde)
 
-V(tau, x) is the largest probability to reach the target A before the avoid set B within the time to go tau. SI units;
-x has shape (*, n), u (*, m), tau and levels (*). Nothing here knows of networks, environments or integration.
+V(tau, x) is the largest probability to reach A before B within the time to go tau, Eq. (exit_value). All quantities are
+in SI units. States x have shape (*, n), controls u (*, m), times to go tau and levels (*). This is the only place where
+the physics is written down; networks, environments and integration are elsewhere.
 """
 
 from __future__ import annotations
@@ -21,14 +22,22 @@ from pirl_rl.sets import Box, Plane
 
 
 class ReachAvoidProblem(ABC):
-    """Base class. A problem gives `horizon`, `states`, `controls`, `drift`, `diffusion` and `target_level`.
+    """The base class of problems.
+
+    A subclass defines `horizon`, `states`, `controls`, `drift`, `diffusion`, and `target_level` or
+    `target_constraints`; an invariance problem needs no target.
+
+    Args:
+        payoff: replaces the payoff of the class.
+        horizon: replaces the horizon of the class, in s.
 
     Attributes:
-        horizon: T > 0 in seconds.
-        states: box for sampling and scaling; nothing is clipped, absorbed or imposed at its edge.
-        controls: box of admissible controls; `action` in a TensorDict is its [-1, 1] coordinate.
-        objective: "reach-avoid", or "invariance": only B absorbs and V(0, x) = 1 outside B.
-        payoff: the (smoothed) indicator of the target.
+        horizon: T > 0, in s.
+        states: the box of states for sampling and scaling. Nothing is clipped, absorbed or imposed at its edge.
+        controls: the box of admissible controls. The entry `action` of a TensorDict is the control in the coordinates
+            in which this box is [-1, 1]^m.
+        objective: "reach-avoid", or "invariance", where only B absorbs and V(0, x) = 1 outside B.
+        payoff: the indicator of A or a smoothing of it.
     """
 
     horizon: float
@@ -45,83 +54,99 @@ class ReachAvoidProblem(ABC):
 
     @abstractmethod
     def drift(self, x: Tensor, u: Tensor) -> Tensor:
-        """f(x, u): (*, n), (*, m) -> (*, n)."""
+        """f(x, u) (*, n), in units of the state per s, at states (*, n) and controls (*, m)."""
 
     @abstractmethod
     def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
-        """sigma(x, u): (*, n), (*, m) -> (*, n, w), one column per noise channel."""
+        """sigma(x, u) (*, n, w), in units of the state per sqrt(s), with one column for each noise channel."""
 
     def target_level(self, x: Tensor) -> Tensor:
-        """(*, n) -> (*), <= 0 inside A. Give this or `target_constraints`."""
+        """The level (*) of A at states (*, n), <= 0 inside. A subclass defines this or `target_constraints`."""
         return self.target_constraints(x).amax(-1)
 
     def target_constraints(self, x: Tensor) -> Tensor:
-        """(*, n) -> (*, k): smooth levels whose intersection is A, for sets with corners."""
+        """Smooth levels (*, k) at states (*, n). Their intersection is A, which may thus have corners.
+
+        Raises:
+            ProblemError: the problem defines no target.
+        """
         if type(self).target_level is ReachAvoidProblem.target_level:
-            raise ProblemError(f"{type(self).__name__} needs target_level(x): <= 0 inside the target")
+            raise ProblemError(f"{type(self).__name__} needs target_level(x), <= 0 inside the target, got none")
         return self.target_level(x).unsqueeze(-1)
 
     def avoid_level(self, x: Tensor) -> Tensor:
-        """(*, n) -> (*), <= 0 inside B; B is empty unless this or `avoid_constraints` is given."""
+        """The level (*) of B at states (*, n), <= 0 inside; without it and `avoid_constraints`, B is empty."""
         return self.avoid_constraints(x).amin(-1)
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
-        """(*, n) -> (*, k): smooth levels whose union is B."""
+        """Smooth levels (*, k) at states (*, n). Their union is B."""
         if type(self).avoid_level is ReachAvoidProblem.avoid_level:
             return x.new_full((*x.shape[:-1], 1), torch.inf)
         return self.avoid_level(x).unsqueeze(-1)
 
     def unreachable(self, x: Tensor) -> Tensor:
-        """(*, n) -> (*) bool: states outside A and B from which V = 0 is known."""
+        """Which of the states (*, n) outside A and B are known to have V = 0 for every tau, (*) bool."""
         return torch.zeros(x.shape[:-1], dtype=torch.bool, device=x.device)
 
     def faces(self, count: int, rng: torch.Generator | None = None) -> tuple[Tensor, Tensor] | None:
-        """Points (count, n) on the faces of A and B and the value V (count,) there, for sets too thin to be found by
-        sampling; None leaves it to bisection on the level functions."""
+        """Points on the faces of A and B, for sets that are too thin to be found by sampling.
+
+        Args:
+            count: the number of points.
+            rng: the random generator to draw from.
+
+        Returns:
+            Points (count, n) and the value V (count,) there, or None, and then the points are found by bisection of
+            the level functions.
+        """
         return None
 
     def exact_value(self, tau: Tensor, x: Tensor) -> Tensor | None:
-        """V(tau, x): (*), (*, n) -> (*), where it is known in closed form."""
+        """V (*) at times to go (*) and states (*, n), or None if no closed form is known."""
         return None
 
     def optimal_control(self, tau: Tensor, x: Tensor) -> Tensor | None:
-        """An optimal u: (*), (*, n) -> (*, m), where it is known."""
+        """An optimal control (*, m) at times to go (*) and states (*, n), or None if none is known."""
         return None
 
     @property
     def planes(self) -> Mapping[str, Plane]:
-        """Sections of the state space to look at, by name; none by default."""
+        """Sections of the state space for figures, by name; none by default."""
         return {}
 
-    # What the sets and the payoff say together.
+    # The methods below follow from the sets and the payoff; a subclass has no need to redefine them.
 
     @property
     def has_avoid_set(self) -> bool:
+        """Whether the problem defines a set B."""
         kind, base = type(self), ReachAvoidProblem
         return kind.avoid_level is not base.avoid_level or kind.avoid_constraints is not base.avoid_constraints
 
     def reached_constraints(self, x: Tensor) -> Tensor:
-        """(*, k) levels of the set that absorbs with success: A, or A_eps with a smoothed payoff."""
+        """Levels (*, k), at states (*, n), of the set that absorbs with success: A, or A_eps of a smoothed payoff."""
         if self.payoff.epsilon == 0:
             return self.target_constraints(x)
         return _normalized(self.target_constraints, x) + self.payoff.epsilon
 
     def reached(self, x: Tensor) -> Tensor:
-        """(*) bool: absorbed with success. Never in an invariance problem, where success is survival."""
+        """Whether states (*, n) are absorbed with success, (*) bool; never in an invariance problem."""
         if self.objective == "invariance":
             return torch.zeros(x.shape[:-1], dtype=torch.bool, device=x.device)
         return (self.reached_constraints(x) <= 0).all(-1)
 
     def failed(self, x: Tensor) -> Tensor:
-        """(*) bool: inside B."""
+        """Whether states (*, n) are inside B, (*) bool."""
         return self.avoid_level(x) <= 0
 
     def interior(self, x: Tensor) -> Tensor:
-        """(*) bool: outside both absorbing sets, where the HJB equation holds."""
+        """Whether states (*, n) are outside both absorbing sets, where Eq. (hjb_pde) holds, (*) bool."""
         return ~(self.reached(x) | self.failed(x))
 
     def boundary_value(self, x: Tensor) -> Tensor:
-        """V on the boundary, Eq. (parabolic_boundary): l_eps at tau = 0 and in A_eps, 0 in B; (*, n) -> (*)."""
+        """V (*) at states (*, n) of the boundary, Eq. (parabolic_boundary): l_eps at tau = 0 and in A_eps, 0 in B.
+
+        In an invariance problem it is 1 outside B.
+        """
         alive = (~self.failed(x)).to(x.dtype)
         if self.objective == "invariance":
             return alive
@@ -131,7 +156,7 @@ class ReachAvoidProblem(ABC):
 
 
 def has_controlled_noise(problem: ReachAvoidProblem, points: int = 256, seed: int = 0) -> bool:
-    """Whether sigma depends on u, found on sampled states and pairs of controls."""
+    """Whether sigma depends on u, judged by `points` sampled states, each with two sampled controls."""
     rng = torch.Generator().manual_seed(seed)
     x = problem.states.sample(points, rng)
     one, other = (problem.diffusion(x, problem.controls.sample(points, rng)) for _ in range(2))
@@ -139,7 +164,7 @@ def has_controlled_noise(problem: ReachAvoidProblem, points: int = 256, seed: in
 
 
 def _normalized(levels, x: Tensor) -> Tensor:
-    """g/|grad g| for each of the k levels: the signed distance to the surface g = 0, to first order."""
+    """g/|grad g| (*, k) of each of the k levels: the signed distance to the surface g = 0, to first order."""
     value, pullback = torch.func.vjp(levels, x)  # type: ignore[misc]
     gradients = torch.stack([pullback(one.expand_as(value))[0] for one in torch.eye(value.shape[-1]).to(value)], -2)
     slope = gradients.norm(dim=-1)
@@ -147,13 +172,16 @@ def _normalized(levels, x: Tensor) -> Tensor:
 
 
 def check_problem(problem: ReachAvoidProblem, points: int = 100_000, seed: int = 0) -> None:
-    """Refuse a problem that contradicts itself: wrong shapes, no horizon, or sets that overlap on sampled points.
+    """Refuse a problem whose parts are missing, have wrong shapes, or contradict each other.
 
     Args:
-        points: how many points of `states`, widened by half, are tried for the overlap of A and B.
+        problem: the problem to check.
+        points: the number of states, uniform in the box `states` expanded by 1.5, at which A and B must not overlap.
+        seed: the seed of these states.
 
     Raises:
-        ProblemError: with the part, what was expected and what was got.
+        ProblemError: an attribute is missing, the horizon is not positive, an output has the wrong shape, or a sampled
+            state lies in both A and B.
     """
     name = type(problem).__name__
     for attribute in ("horizon", "states", "controls"):

@@ -1,4 +1,4 @@
-"""What a user sees of the loop, and how he stops it."""
+"""The progress of training on the terminal, and stopping it with Ctrl-C."""
 
 from __future__ import annotations
 
@@ -12,17 +12,23 @@ from tqdm import tqdm
 
 EVALUATED = ("value_mse", "success_rate", "calibration_mse", "hjb_loss", "td_loss")
 TRAINED = ("train_td_loss", "train_hjb_loss", "train_boundary_loss")
-"""What the progress shows, of an evaluation and between evaluations."""
+"""The metrics that are shown: those of an evaluation, or between evaluations those of training."""
 
 
 class Progress:
-    """A bar on a terminal; elsewhere plain lines, at each evaluation and each tenth of the run."""
+    """A progress bar on a terminal. Elsewhere plain lines, at each evaluation and after each tenth of the run.
+
+    Args:
+        total: updates of the run.
+        done: updates made before, if the run is resumed.
+    """
 
     def __init__(self, total: int, done: int):
         self.bar = tqdm(total=total, initial=done, unit="update", disable=None, dynamic_ncols=True)
         self.total, self.shown = total, done
 
     def show(self, update: int, row: Mapping[str, float]) -> None:
+        """Show the number of updates made, and the metrics of a row, which may be empty."""
         if not self.bar.disable:
             self.bar.update(update - self.bar.n)
         evaluated = any(name in row for name in EVALUATED)
@@ -44,7 +50,13 @@ class Progress:
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """SIGINT raises a flag instead of an exception, so that the loop ends between two updates; a second one kills."""
+    """Let SIGINT set a flag in place of raising an exception, so that training stops between two updates.
+
+    A second SIGINT raises `KeyboardInterrupt`.
+
+    Yields:
+        A function that tells whether SIGINT came. Outside the main thread it is always false.
+    """
     asked = False
 
     def ask(number, frame):
@@ -55,7 +67,7 @@ def interruptible() -> Iterator[Callable[[], bool]]:
 
     try:
         previous = signal.signal(signal.SIGINT, ask)
-    except ValueError:  # not in the main thread: nobody sends us signals there
+    except ValueError:  # signals reach only the main thread
         yield lambda: False
         return
     try:

@@ -1,4 +1,4 @@
-"""Schedules: the weights (w_TD, w_HJB, w_BC) of the critic loss over a run, or over one stage of it."""
+"""Schedules: the weights (w_TD, w_HJB, w_BC) of Eq. (critic_loss) as functions of the update, over a run or a stage."""
 
 from __future__ import annotations
 
@@ -10,31 +10,30 @@ from pirl_rl.errors import ArgumentError
 
 Weights = tuple[float, float, float]
 WEIGHTS = ("td_weight", "hjb_weight", "boundary_weight")
-"""Names of the weights, in this order."""
+"""Names of the weights in the loss and in the metrics, in the order of `Weights`."""
 
 
 class Schedule(Protocol):
-    """Weights, and how far the transition between their two ends has come.
+    """Gives the weights of the critic loss at an update.
 
-    Args:
-        update: k, counted from 0 at the start of the run or of the stage that the schedule belongs to.
-        length: updates of that run or stage.
+    In both methods, `update` is counted from 0 at the start of the run, or of the stage to which the schedule belongs,
+    and `length` is the number of updates of that run or stage.
     """
 
     def __call__(self, update: int, length: int) -> Weights:
-        """(w_TD, w_HJB, w_BC)."""
+        """The weights (w_TD, w_HJB, w_BC)."""
         ...
 
     def progress(self, update: int, length: int) -> float:
-        """eta in [0, 1]; samplers that move with the schedule, as `ReplayCollocation`, follow it."""
+        """The progress eta, in [0, 1], from the initial to the final weights; `ReplayCollocation` follows it too."""
         ...
 
 
 def check_weights(name: str, values: Sequence[float]) -> Weights:
-    """Three finite weights that are not negative.
+    """The weights, as three floats.
 
     Raises:
-        ArgumentError: naming the argument.
+        ArgumentError: they are not three finite numbers >= 0; the message names `name`.
     """
     numbers = tuple(float(value) for value in values)
     if len(numbers) != 3 or not all(math.isfinite(value) and value >= 0 for value in numbers):
@@ -45,7 +44,7 @@ def check_weights(name: str, values: Sequence[float]) -> Weights:
 
 
 class _Transition:
-    """w_i(k) = w_i^init + (w_i^final - w_i^init) eta(k), Eq. (weight_scheduling)."""
+    """w_i(k) = w_i^init + (w_i^final - w_i^init) eta(k), Eq. (weight_scheduling), with eta from a subclass."""
 
     def __init__(self, initial: Sequence[float], final: Sequence[float]):
         self.initial, self.final = check_weights("initial", initial), check_weights("final", final)
@@ -59,17 +58,18 @@ class _Transition:
 
 
 class LossSchedule(_Transition):
-    """The paper's sigmoid: eta(k) = 1 / (1 + exp(-steepness (k - center))).
+    """The sigmoid of the paper: eta(k) = 1 / (1 + exp(-steepness (k - center))), Eq. (weight_scheduling).
 
     Args:
         initial: (w_TD, w_HJB, w_BC) before the transition.
-        final: the same after it.
-        center: where the transition is half done: a number above 1 is an update, a number up to 1 is a share of the
-            length.
-        steepness: alpha > 0, in 1/updates beside a center in updates, in 1/length beside a center that is a share.
+        final: (w_TD, w_HJB, w_BC) after the transition.
+        center: where eta = 1/2. A number above 1 is an update; a number up to 1 is a share of the length of the run or
+            stage.
+        steepness: alpha > 0, in 1/updates if the center is an update, in 1/length if the center is a share.
 
     Raises:
-        ArgumentError: weights that are no three numbers >= 0, a center that is not finite, a steepness <= 0.
+        ArgumentError: the weights are not three finite numbers >= 0, `center` is not finite, or `steepness` is not
+            positive and finite.
     """
 
     def __init__(self, initial: Sequence[float], final: Sequence[float], center: float, steepness: float):
@@ -84,16 +84,16 @@ class LossSchedule(_Transition):
 
 
 class LinearSchedule(_Transition):
-    """eta rises linearly from 0 at `start` to 1 at `end`.
+    """A linear transition: eta rises from 0 at `start` to 1 at `end`.
 
     Args:
-        initial: (w_TD, w_HJB, w_BC) up to the start.
-        final: the same from the end on.
-        start: an update, or a share of the length where `end` is at most 1.
-        end: an update if above 1, else a share of the length.
+        initial: (w_TD, w_HJB, w_BC) until `start`.
+        final: (w_TD, w_HJB, w_BC) from `end` on.
+        start: an update, or a share of the length of the run or stage if `end` is one.
+        end: a number above 1 is an update; a number up to 1 is a share of the length of the run or stage.
 
     Raises:
-        ArgumentError: weights that are no three numbers >= 0, an end that is not after the start.
+        ArgumentError: the weights are not three finite numbers >= 0, or `end` is not above `start`.
     """
 
     def __init__(self, initial: Sequence[float], final: Sequence[float], start: float, end: float):
@@ -108,11 +108,15 @@ class LinearSchedule(_Transition):
 
 
 class ConstantSchedule(_Transition):
-    """The final weights from the first update on.
+    """The final weights at all updates: eta = 1.
 
     Args:
-        initial: never in force; a method of `conf/method` sets both ends of whatever schedule is chosen.
-        final: (w_TD, w_HJB, w_BC).
+        initial: checked but not used; it is an argument because the methods in `conf/method` set `initial` and `final`
+            of every schedule.
+        final: (w_TD, w_HJB, w_BC) at all updates.
+
+    Raises:
+        ArgumentError: the weights are not three finite numbers >= 0.
     """
 
     def progress(self, update: int, length: int) -> float:

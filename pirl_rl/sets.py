@@ -1,7 +1,7 @@
 """Boxes and the algebra of level sets.
 
-A closed set S is written as a level function g with S = {x : g(x) <= 0}: one function gives membership, the crossing of
-the boundary between two time steps, and contours. Levels have shape (*) where states have shape (*, n).
+A closed set S is described by a level function g with S = {x : g(x) <= 0}. This one function gives membership,
+crossings of the boundary between two time steps, and contours. The level of states (*, n) has shape (*).
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ class Box:
 
     Args:
         low: lower corner, n finite numbers.
-        high: upper corner, n finite numbers, each above its lower one.
+        high: upper corner, n finite numbers, each above that of `low`.
 
     Raises:
-        ValueError: corners of different lengths, empty, not finite or not ordered.
+        ArgumentError: the corners have different lengths, are empty, not finite or not ordered.
     """
 
     def __init__(self, low: Sequence[float], high: Sequence[float]):
@@ -41,10 +41,11 @@ class Box:
 
     @property
     def dim(self) -> int:
+        """The dimension n."""
         return len(self.low)
 
     def center_and_half_width(self, like: Tensor) -> tuple[Tensor, Tensor]:
-        """Center and half width, each (n,), in the dtype and on the device of `like`."""
+        """The center and half the widths, each (n,), with the dtype and the device of `like`."""
         key = (like.dtype, like.device)
         if key not in self._cache:
             low, high = (torch.tensor(corner, dtype=like.dtype, device=like.device) for corner in (self.low, self.high))
@@ -52,17 +53,17 @@ class Box:
         return self._cache[key]
 
     def normalize(self, x: Tensor) -> Tensor:
-        """Physical (*, n) to [-1, 1] coordinates; points outside the box map outside [-1, 1]."""
+        """Map physical points (*, n) to coordinates in which the box is [-1, 1]^n; points outside are not clipped."""
         center, half_width = self.center_and_half_width(x)
         return (x - center) / half_width
 
     def denormalize(self, z: Tensor) -> Tensor:
-        """[-1, 1] coordinates (*, n) to physical."""
+        """Map coordinates (*, n), in which the box is [-1, 1]^n, to physical points (*, n)."""
         center, half_width = self.center_and_half_width(z)
         return center + half_width * z
 
     def contains(self, x: Tensor) -> Tensor:
-        """Membership (*) of points (*, n)."""
+        """Whether points (*, n) lie in the closed box, (*) bool."""
         return (self.normalize(x).abs() <= 1).all(-1)
 
     def sample(
@@ -72,12 +73,12 @@ class Box:
         dtype: torch.dtype | None = None,
         device: torch.device | str | None = None,
     ) -> Tensor:
-        """Uniform points (count, n)."""
+        """Draw points (count, n) uniformly from the box."""
         unit = torch.rand(count, self.dim, generator=rng, dtype=dtype, device=device)
         return self.denormalize(2 * unit - 1)
 
     def expand(self, factor: float) -> Box:
-        """The box of the same center whose widths are `factor` times as large."""
+        """A box with the same center and `factor` times the widths."""
         middle = [(a + b) / 2 for a, b in zip(self.low, self.high, strict=True)]
         half = [factor * (b - a) / 2 for a, b in zip(self.low, self.high, strict=True)]
         return Box(
@@ -96,13 +97,13 @@ class Box:
 
 @dataclass(frozen=True)
 class Plane:
-    """A two-dimensional section of the state space, for figures and for starts of episodes.
+    """A two-dimensional section of the state space, for figures and for the initial states of episodes.
 
     Attributes:
         axes: names of the two coordinates, with units.
-        box: their range.
-        embed: points of the plane (*, 2) to states (*, n).
-        project: states (*, n) to the plane's coordinates (*, 2).
+        box: range of the two coordinates.
+        embed: maps points of the plane (*, 2) to states (*, n).
+        project: maps states (*, n) to the coordinates of the plane (*, 2).
     """
 
     axes: tuple[str, str]
@@ -112,25 +113,25 @@ class Plane:
 
 
 def union(*levels: Tensor) -> Tensor:
-    """Level of the union of sets, from their levels."""
+    """The level (*) of the union of sets with the given levels (*)."""
     return torch.stack(levels).amin(0)
 
 
 def intersection(*levels: Tensor) -> Tensor:
-    """Level of the intersection of sets, from their levels."""
+    """The level (*) of the intersection of sets with the given levels (*)."""
     return torch.stack(levels).amax(0)
 
 
 def complement(level: Tensor) -> Tensor:
-    """Level of the (closed) complement of a set, from its level."""
+    """The level (*) of the closed complement of a set with the given level (*)."""
     return -level
 
 
 def difference(level: Tensor, other: Tensor) -> Tensor:
-    """Level of the first set without the second, from their levels."""
+    """The level (*) of the first set without the interior of the second, from their levels (*)."""
     return intersection(level, complement(other))
 
 
 def band(value: Tensor, center: Tensor | float, half_width: float) -> Tensor:
-    """Level of {|value - center| <= half_width}."""
+    """The level (*) of the set {|value - center| <= half_width}."""
     return (value - center).abs() - half_width

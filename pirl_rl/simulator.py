@@ -1,15 +1,16 @@
-"""One control step of the SDE, with its exits.
+"""Simulation of the SDE, Eq. (sde), over one control step, with exits into A and B.
 
-Three step sizes stay apart: how long a control is held (dt), how finely the SDE is integrated (dt / substeps, by
-Euler-Maruyama), and how exits are watched (crossing):
+A control is held for dt. The SDE is integrated by the Euler-Maruyama scheme with sub-steps of length h = dt / substeps.
+How an exit within a sub-step is detected is the rule `crossing`:
 
-- "endpoint": an exit is seen only where a sub-step ends.
-- "bridge": between the ends of a sub-step the path is a Brownian bridge, which crosses a smooth face g = 0 with
-  probability exp(-2 g0 g1 / (|sigma^T grad g|^2 h)), g0 and g1 the levels at both ends: exact for constant
-  coefficients and a flat face (Gobet 2000), sigma frozen at the start of the sub-step. A face of a target with corners
-  counts only where all its other constraints hold at both ends.
+- "endpoint": an exit is detected only at the end of a sub-step.
+- "bridge": between the ends of a sub-step the path is a Brownian bridge. It crosses a smooth face g = 0 with the
+  probability exp(-2 g0 g1 / (|sigma^T grad g|^2 h)) of Eq. (bridge), where g0 and g1 are the levels at both ends, and
+  sigma and grad g are taken at the start. This is exact for constant coefficients and a flat face (E. Gobet, Stochastic
+  Processes and their Applications 87, 2000). A face of a target with corners counts only if all other constraints of
+  the target hold at both ends.
 
-A sub-step that shows both exits counts as a failure.
+A path that both reaches A and enters B within one sub-step counts as a failure.
 """
 
 from __future__ import annotations
@@ -25,7 +26,13 @@ from pirl_rl.problem import ReachAvoidProblem
 
 
 class Step(NamedTuple):
-    """State after the step (*, n), held where a path ended; `reached` and `failed`, (*) bool, never both."""
+    """The outcome of a control step.
+
+    Attributes:
+        state: states after the step (N, n); a path that ended keeps the state of the sub-step in which it ended.
+        reached: paths that reached A (N,) bool.
+        failed: paths that entered B (N,) bool; none of them counts as reached.
+    """
 
     state: Tensor
     reached: Tensor
@@ -33,7 +40,7 @@ class Step(NamedTuple):
 
 
 def exit_value(problem: ReachAvoidProblem, step: Step) -> Tensor:
-    """Payoff (N,) of paths that end with this step: 1 where it reached, 0 where it failed, else l_eps of the state."""
+    """The payoff (N,) of paths that end with this step: 1 if they reached A, 0 if they entered B, else l_eps."""
     payoff = torch.where(step.reached, torch.ones_like(step.state[..., 0]), problem.boundary_value(step.state))
     return torch.where(step.failed, torch.zeros_like(payoff), payoff)
 
@@ -44,12 +51,12 @@ class Simulator:
 
     Args:
         problem: the physics.
-        dt: how long a control is held, s.
-        substeps: integration steps in it.
-        crossing: how exits are watched.
+        dt: the length of a control step, in s.
+        substeps: the number of integration steps in a control step.
+        crossing: "bridge" or "endpoint", how exits within a sub-step are detected.
 
     Raises:
-        ValueError: dt not in (0, horizon], substeps < 1, an unknown crossing rule.
+        ArgumentError: `dt` is not in (0, horizon], `substeps` is below 1, or `crossing` is unknown.
     """
 
     problem: ReachAvoidProblem
@@ -71,11 +78,11 @@ class Simulator:
 
         Args:
             x: states (N, n).
-            u: physical controls (N, m), held.
-            rng: source of the noise.
-            dt: lengths (N,) of this step where they differ between paths; default `self.dt`.
+            u: physical controls (N, m), held over the step.
+            rng: the random generator of the noise and of the crossings.
+            dt: the length of the step for each path (N,), in s; default `self.dt` for all.
         """
-        # Column by column in memory, as the physics reads states.
+        # Each coordinate is made contiguous in memory, because problems unbind states into coordinates.
         x = x.mT.contiguous().mT
         h = (x.new_tensor(self.dt) if dt is None else dt) / self.substeps
         reached = torch.zeros(x.shape[:-1], dtype=torch.bool, device=x.device)
@@ -93,7 +100,7 @@ class Simulator:
         return Step(x, reached, failed)
 
     def flow(self, x: Tensor, u: Tensor) -> Tensor:
-        """The control step without noise and exits, (N, n) and (N, m) -> (N, n); gradients pass."""
+        """States (N, n) after a control step without noise and exits; differentiable in x (N, n) and u (N, m)."""
         for _ in range(self.substeps):
             x = x + self.problem.drift(x, u) * (self.dt / self.substeps)
         return x
@@ -103,7 +110,7 @@ class Simulator:
         channels = sigma.shape[-1]
         noise = torch.randn((channels, *x.shape[:-1]), generator=rng, dtype=x.dtype, device=x.device) * h.sqrt()
         if all(stride == 0 for stride in sigma.stride()[:-2]):
-            # One matrix expanded to all states: a product of two matrices in place of N small ones.
+            # sigma is one matrix, expanded to all states: one product of two matrices replaces N small ones.
             moved = (sigma[(0,) * (sigma.ndim - 2)] @ noise).mT
         else:
             moved = (sigma * noise.movedim(0, -1).unsqueeze(-2)).sum(-1)
@@ -124,12 +131,12 @@ class Simulator:
 
     @staticmethod
     def _crossed(constraints, x, moved, sigma, h, rng) -> tuple[Tensor, Tensor]:
-        """For each face (N, k): did the bridge cross it, and do all other constraints hold at both ends?"""
+        """Whether the bridge crossed each face, and whether all other constraints hold at both ends; (N, k) bool."""
         before, after = constraints(x), constraints(moved)
         columns = [torch.func.jvp(constraints, (x,), (column,))[1] for column in sigma.unbind(-1)]
         variance = torch.stack([column**2 for column in columns]).sum(0) * h[..., None]
         exponent = -2 * before * after / variance
-        # 0/0 and inf/0: a face along which the noise does not act is not crossed between the ends.
+        # Where the variance is 0, the exponent is NaN or infinite, and the face is not crossed between the ends.
         probability = torch.where((variance > 0) & (before > 0) & (after > 0), exponent.exp(), torch.zeros_like(before))
         crossed = torch.rand(before.shape, generator=rng, dtype=x.dtype, device=x.device) < probability
         held = (before <= 0) & (after <= 0)

@@ -1,7 +1,7 @@
-"""A solution: a problem, the actor and the critics that were learned for it.
+"""A solution: a problem with the actor and the critics that were learned for it.
 
-It says what the networks say: the value V(tau, x), the policy that should attain it, the gradient and the HJB residual
-of V. Reading a solution needs no training loss.
+It evaluates the learned value V(tau, x), its gradient and its HJB residual, and the learned policy. It does not need
+the training loss.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from pirl_rl.problem import ReachAvoidProblem
 
 
 class Solution:
-    """V is the mean of the critics at u = pi(tau, x).
+    """The learned value and policy, where V is the mean of the critics at u = pi(tau, x).
 
-    In every method tau is (N,) in s and x is (N, n) in SI units; answers are in the networks' dtype.
+    In every method tau is (N,), in s, and x is (N, n), in SI units. Results have the dtype of the networks.
 
     Args:
         problem: the physics.
-        actor: pi(tau, x).
-        critic: all critics as one module whose parameters carry a leading axis, see `pirl_rl.networks.stack`.
+        actor: the policy pi(tau, x).
+        critic: all critics in one module whose parameters have a leading axis, see `pirl_rl.networks.stack`.
     """
 
     def __init__(self, problem: ReachAvoidProblem, actor: Actor, critic: Critic):
@@ -30,39 +30,47 @@ class Solution:
 
     @property
     def dtype(self) -> torch.dtype:
+        """The dtype of the networks."""
         return next(self.actor.parameters()).dtype
 
     @property
     def device(self) -> torch.device:
+        """The device of the networks."""
         return next(self.actor.parameters()).device
 
     @torch.no_grad()
     def policy(self, tau: Tensor, x: Tensor) -> Tensor:
-        """The physical control (N, m)."""
+        """The control pi(tau, x) (N, m), in SI units."""
         return self.problem.controls.denormalize(self._action(*self._own(tau, x)))
 
     @torch.no_grad()
     def raw_value(self, tau: Tensor, x: Tensor) -> Tensor:
-        """The networks' own V (N,), with no knowledge of the sets."""
+        """V (N,) as the networks give it, neither clipped nor corrected inside A and B."""
         tau, x = self._own(tau, x)
         return self.critic.at(self._action(tau, x))(tau, x).mean(0)
 
     @torch.no_grad()
     def value(self, tau: Tensor, x: Tensor) -> Tensor:
-        """V (N,) in [0, 1]: 1 where a path has succeeded, 0 where it failed or cannot succeed, else `raw_value`."""
+        """V (N,): 1 in A, 0 in B and in unreachable states, and elsewhere `raw_value` clipped to [0, 1]."""
         lost = self.problem.failed(x) | self.problem.unreachable(x)
         return self.raw_value(tau, x).clamp(0, 1).masked_fill(self.problem.reached(x), 1.0).masked_fill(lost, 0.0)
 
     @torch.no_grad()
     def residual(self, tau: Tensor, x: Tensor, u: Tensor | None = None) -> Tensor:
-        """L^u V (N,) in 1/s, the critics' action frozen at the policy; u (N, m) physical, default the policy's."""
+        """The HJB residual L^u V (N,), in 1/s, Eq. (parabolic_operator); the action of the critics is frozen.
+
+        Args:
+            tau: times to go (N,), in s.
+            x: states (N, n).
+            u: controls (N, m) in f and sigma, in SI units; default pi(tau, x), as in Eq. (linear_pde).
+        """
         tau, x = self._own(tau, x)
         action = self._action(tau, x)
         u = self.problem.controls.denormalize(action) if u is None else u
         return generator(self.critic.at(action), self.problem, tau, x, u).mean(0)
 
     def gradient(self, tau: Tensor, x: Tensor) -> Tensor:
-        """grad_x of `raw_value` (N, n), the critics' action frozen at the policy."""
+        """The gradient of `raw_value` in x (N, n), per unit of the state; the action of the critics is frozen."""
         tau, x = self._own(tau, x)
         action = self._action(tau, x).detach()
         x = x.detach().requires_grad_()

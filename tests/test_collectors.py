@@ -104,7 +104,7 @@ def test_noise_where_it_is_wanted():
     ("make", "message"),
     [
         (lambda: Exploration(-0.1, "always"), "noise >= 0.*got -0.1 and 'always'"),
-        (lambda: Exploration(0.1, "never"), "always or at start; got 0.1 and 'never'"),
+        (lambda: Exploration(0.1, "never"), "'always' or 'start', got 0.1 and 'never'"),
         (lambda: Transitions(0), "collector.n_steps: expected at least 1, got 0"),
     ],
 )

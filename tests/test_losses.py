@@ -501,7 +501,7 @@ def test_wrong_arguments_are_named(kwargs, message):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ClippedSurrogate(0.0), r"actor_rule.deviation: expected noise > 0 on played actions, got 0\.0"),
+        (lambda: ClippedSurrogate(0.0), r"actor_rule.deviation: expected a standard deviation > 0, got 0\.0"),
         (lambda: ClippedSurrogate(0.2, clip=0.0), r"actor_rule.clip: expected a number > 0, got 0\.0"),
         (lambda: LookAhead(0, Simulator(Reach1D())), "actor_rule.steps: expected at least 1, got 0"),
         (lambda: Sum([]), "actor_rule.rules: expected at least one rule, got none"),

@@ -1,8 +1,8 @@
-"""Actor rules: what the actor ascends. Each rule is one class with its equation, its arguments and its check.
+"""Actor rules: the objectives that the actor ascends. Each rule is one class.
 
-Notation: y = (tau, x) is the state with its time to go, pi(y) the actor's action in [-1, 1], u the same in physical
-units. V(y) is the mean of the critics at pi(y). A prime marks the state after a transition, r its reward, and d is 1
-where the episode ended.
+Notation: y = (tau, x) is the state with its time to go, pi(y) the action of the actor, normalised to [-1, 1], and u the
+same control in SI units. V(y) is the mean of the critics at pi(y). y' is the state after a transition, r its reward,
+and d is 1 if the episode ended with it, else 0.
 """
 
 from pirl_rl.actor_rules.base import ActorRule

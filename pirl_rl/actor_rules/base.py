@@ -17,9 +17,9 @@ class ActorRule(ABC):
     """An objective that the actor ascends.
 
     Attributes:
-        compiles_whole: whether the objective is compiled as one function together with the rest of the actor's loss.
-            A rule that loops over the simulator is not, since the loop would unroll into thousands of operations; it
-            then compiles its inner function in `compile`.
+        compiles_whole: whether the objective is compiled as one function with the rest of the actor's loss. A rule
+            that loops over the simulator is not, since the loop would be unrolled into thousands of operations; it
+            compiles the body of the loop in `compile`.
     """
 
     compiles_whole: ClassVar[bool] = True
@@ -29,12 +29,12 @@ class ActorRule(ABC):
         """The objective, a scalar.
 
         Args:
-            solution: the actor, whose parameters take gradients, and the critics, whose parameters do not.
-            replay: N transitions with "tau" (N, 1), "state" (N, n), the played "action" (N, m), the actor's output
-                "loc" (N, m) behind it, and where returns are wanted "next" with "tau", "state", "reward" and
-                "terminated".
-            points: collocation points with "tau", "state" and "mask" (N,); the states of `replay`, without a mask,
-                where no physics is imposed.
+            solution: the actor, whose parameters get gradients, and the critics, whose parameters do not.
+            replay: N transitions with "tau" (N, 1), "state" (N, n), the played "action" (N, m) and the actor's output
+                "loc" (N, m) from which it was made. If the weight of the TD loss is above 0, "next" has "tau",
+                "state", "reward" and "terminated", else it is missing.
+            points: K collocation points with "tau" (K, 1), "state" (K, n) and "mask" (K,), or `replay`, which has no
+                mask, if the weight of the HJB residual is 0.
         """
 
     def check(self, critic: Critic, exploration_noise: float | None = None) -> None:  # noqa: B027
@@ -42,15 +42,15 @@ class ActorRule(ABC):
 
         Args:
             critic: one of the critics.
-            exploration_noise: standard deviation of the noise on played actions, if it is known.
+            exploration_noise: standard deviation of the noise on played actions, or None if it is not known yet.
 
         Raises:
-            ArgumentError: with what was expected and what was got.
+            ArgumentError: the rule does not work with them.
         """
 
     def compile(self, compiler: Callable[[Any], Any]) -> None:  # noqa: B027
-        """Compile inner functions of a rule that is not compiled as a whole.
+        """Compile the inner functions of a rule that is not compiled as a whole.
 
         Args:
-            compiler: gives the compiled version of a function, or the function itself where nothing is compiled.
+            compiler: returns the compiled version of a function, or the function itself if nothing is compiled.
         """

@@ -1,4 +1,4 @@
-"""Policy gradients of what was really played."""
+"""Policy gradients from the returns of played actions."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from pirl_rl.solution import Solution
 
 
 class ClippedSurrogate(ActorRule):
-    """The mean of min(rho A, clip(rho, 1 - c, 1 + c) A), the surrogate of PPO (Schulman et al. 2017, arXiv:1707.06347).
+    """The mean of min(rho A, clip(rho, 1 - c, 1 + c) A) over transitions, Eq. (clipped_surrogate).
 
-    rho is the ratio of the densities of the played action under pi and under the policy that played it. Both are
-    Gaussians around the actor's output; that actions are cut at -1 and 1 is neglected. The advantage is
-    A = r + (1 - d) V(y') - V(y), divided by its standard deviation over the batch. Unlike the other rules, this one
-    sees the outcome of what was really played, noise and exits included, and no slope of V. It needs noise on every
-    action, hence `collector.exploration=always`.
+    This is the surrogate of PPO (Schulman et al. 2017, arXiv:1707.06347). rho is the ratio of the densities of the
+    played action under pi and under the policy that played it. Both are Gaussians around the actor's output; the
+    clipping of actions to [-1, 1] is neglected. The advantage is A = r + (1 - d) V(y') - V(y), divided by its standard
+    deviation over the batch. Unlike the other rules, this one uses the outcomes of played actions, with their noise and
+    exits, and no derivative of V. It needs noise on every action, hence `collector.exploration=always`.
 
     Args:
-        deviation: standard deviation of the exploration noise, in [-1, 1] coordinates of the control, above 0.
-        clip: c, how far the ratio of densities counts.
+        deviation: standard deviation of the exploration noise on normalised actions, above 0.
+        clip: c > 0; ratios beyond 1 - c or 1 + c give no further gain.
 
     Raises:
-        ArgumentError: a deviation or a clip that is not positive.
+        ArgumentError: `deviation` or `clip` is not positive.
     """
 
     def __init__(self, deviation: float, clip: float = 0.2):
         if not deviation > 0:
-            raise ArgumentError(f"actor_rule.deviation: expected noise > 0 on played actions, got {deviation}")
+            raise ArgumentError(f"actor_rule.deviation: expected a standard deviation > 0, got {deviation}")
         if not clip > 0:
             raise ArgumentError(f"actor_rule.clip: expected a number > 0, got {clip}")
         self.deviation, self.clip = deviation, clip
@@ -41,7 +41,7 @@ class ClippedSurrogate(ActorRule):
         following: TensorDictBase | None = replay.get("next", None)
         if following is None:
             raise ArgumentError(
-                "actor_rule: ClippedSurrogate follows returns, expected a weight of the TD loss above 0, got 0"
+                "actor_rule: ClippedSurrogate uses returns, expected a weight of the TD loss above 0, got 0"
             )
         with torch.no_grad():
             here, there = (
@@ -63,6 +63,6 @@ class ClippedSurrogate(ActorRule):
             )
         if exploration_noise is not None and exploration_noise != self.deviation:
             raise ArgumentError(
-                "actor_rule.deviation: expected the deviation of the noise on played actions, "
+                "actor_rule.deviation: expected the standard deviation of the noise on played actions, "
                 f"exploration_noise = {exploration_noise}, got {self.deviation}"
             )

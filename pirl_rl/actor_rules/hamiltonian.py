@@ -1,4 +1,4 @@
-"""The Hamiltonian of the known model."""
+"""The Hamiltonian of the HJB equation."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from pirl_rl.solution import Solution
 
 
 class Hamiltonian(ActorRule):
-    """The mean of f(x, u) . grad V + 1/2 Tr(sigma sigma^T hess V) at u = pi(y), over points; Eq. (generator).
+    """The mean over points of f(x, u) . grad V + 1/2 Tr(sigma sigma^T hess V) at u = pi(y), Eq. (generator).
 
-    The derivatives of V are those at the frozen action; the gradient reaches the actor through u alone. The term of
-    second order is left out where sigma does not depend on u.
+    The points are the collocation points; if the weight of the HJB residual is 0, those of the transitions. V is
+    differentiated with the action of the critics frozen, so that the gradient reaches the actor through u alone. -d_tau
+    V, which does not depend on u, is added, and the second-order term is omitted if sigma does not depend on u.
 
     Args:
         problem: the physics.

@@ -1,4 +1,4 @@
-"""The value some control steps ahead along the model."""
+"""The value a few control steps ahead, along the simulated dynamics."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ from pirl_rl.solution import Solution
 
 
 class LookAhead(ActorRule):
-    """The mean of V at the end of a number of noise-free control steps, or at the step that meets A or B.
+    """The mean of V after `steps` noise-free control steps, Eq. (look_ahead), over transitions.
 
-    It is what the Hamiltonian becomes where a control is held for a whole control step.
+    A path stops at the end of the step in which it enters A or B, and at tau = 0; V is 1 in A. As dt tends to 0, one
+    step gives the direction of ascent of `Hamiltonian`, if sigma does not depend on u.
 
     Args:
-        steps: control steps to look ahead, at least 1.
-        simulator: plays them.
+        steps: the number of control steps, at least 1.
+        simulator: simulates the steps.
 
     Raises:
-        ArgumentError: fewer than one step.
+        ArgumentError: `steps` is below 1.
     """
 
     compiles_whole = False
@@ -40,7 +41,7 @@ class LookAhead(ActorRule):
         problem, dt = self.simulator.problem, self.simulator.dt
         tau, x = replay["tau"], replay["state"]
         for _ in range(self.steps):
-            # Half a step of tolerance: tau is a whole number of steps up to rounding.
+            # tau is a whole number of steps up to rounding, hence the tolerance of half a step.
             live = problem.interior(x).unsqueeze(-1) & (tau > dt / 2)
             moved = self.flow(x, problem.controls.denormalize(solution.actor(tau, x)))
             tau, x = torch.where(live, tau - dt, tau), torch.where(live, moved, x)

@@ -12,7 +12,7 @@ from pirl_rl.solution import Solution
 
 
 class Q(ActorRule):
-    """The mean of Q_1(y, pi(y)) over transitions, Eq. (actor_loss) of the paper."""
+    """The mean of Q_1(y, pi(y)) over transitions, with the first critic Q_1; its negative is Eq. (actor_loss)."""
 
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
         tau, x = replay["tau"], replay["state"]
@@ -21,6 +21,6 @@ class Q(ActorRule):
     def check(self, critic: Critic, exploration_noise: float | None = None) -> None:
         if not critic.action_input:
             raise ArgumentError(
-                "actor_rule: Q needs critics Q(tau, x, u), expected critic.action_input=true, got false; critics "
-                "V(tau, x) go with Hamiltonian, LookAhead or ClippedSurrogate"
+                "actor_rule: Q needs critics Q(tau, x, u), expected critic.action_input=true, got false; for critics "
+                "V(tau, x) choose Hamiltonian, LookAhead or ClippedSurrogate"
             )

@@ -1,4 +1,4 @@
-"""Several rules at once."""
+"""The sum of several actor rules."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class Sum(ActorRule):
     """The sum of the objectives of several rules.
 
     Args:
-        rules: at least one.
+        rules: at least one rule.
 
     Raises:
-        ArgumentError: no rule.
+        ArgumentError: there is no rule.
     """
 
     def __init__(self, rules: Sequence[ActorRule]):
@@ -31,6 +31,7 @@ class Sum(ActorRule):
 
     @property
     def compiles_whole(self) -> bool:  # type: ignore[override]
+        """Whether all rules can be compiled as one function."""
         return all(rule.compiles_whole for rule in self.rules)
 
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:

@@ -1,4 +1,4 @@
-"""The replay buffer of a collector: made, saved and refilled."""
+"""Making, saving and restoring the replay buffer of a collector."""
 
 from __future__ import annotations
 
@@ -17,6 +17,11 @@ from pirl_rl.errors import ArgumentError
 def check_sizes(
     env: ReachAvoidEnv, frames_per_batch: int, updates_per_batch: int, warmup_frames: int, buffer_size: int
 ) -> None:
+    """Check the sizes that all collectors have.
+
+    Raises:
+        ArgumentError: a size is out of range; the message names it.
+    """
     envs = env.batch_size[0]
     if frames_per_batch % envs or frames_per_batch < envs:
         raise ArgumentError(
@@ -35,7 +40,10 @@ def check_sizes(
 def make_buffer(
     size: int, device: torch.device, seed: int, shared: bool = False
 ) -> tuple[TensorDictReplayBuffer, torch.Generator]:
-    """A replay buffer and the random generator of its sampling."""
+    """A replay buffer, and the random generator with which it is sampled.
+
+    A shared buffer does not have the generator yet, since it does not survive being sent to another process.
+    """
     storage = LazyTensorStorage(size, device=device, shared_init=shared)
     buffer = TensorDictReplayBuffer(storage=storage, shared=shared)
     rng = torch.Generator(device).manual_seed(seed)
@@ -45,7 +53,8 @@ def make_buffer(
 
 
 def buffer_state(buffer: TensorDictReplayBuffer, rng: torch.Generator) -> dict[str, Any]:
-    # Plain tensors: a memory-mapped one is a class of its own, which a checkpoint does not hold.
+    """The state of a buffer and of its random generator, as tensors and plain values."""
+    # Memory-mapped tensors are a class of their own, which a checkpoint of plain tensors cannot contain.
     plain = buffer[:].apply(lambda entry: entry.as_subclass(torch.Tensor)) if len(buffer) else TensorDict()
     return {
         "transitions": plain.to_dict(),
@@ -57,10 +66,16 @@ def buffer_state(buffer: TensorDictReplayBuffer, rng: torch.Generator) -> dict[s
 def fill_buffer(
     buffer: TensorDictReplayBuffer, device: torch.device, env: ReachAvoidEnv, state: dict[str, Any]
 ) -> None:
-    """Put the transitions of another buffer's state into an empty one, oldest first; the newest where it is smaller.
+    """Copy the transitions of another buffer's state into an empty buffer; if it is smaller, the newest ones.
+
+    Args:
+        buffer: the empty buffer.
+        device: the device of the buffer.
+        env: an environment with which the transitions must agree.
+        state: the state of the other buffer, see `buffer_state`.
 
     Raises:
-        ArgumentError: they are not those of such an environment.
+        ArgumentError: the transitions lack an entry or have another shape than those of the environment.
     """
     if not state["transitions"]:
         return
@@ -69,17 +84,20 @@ def fill_buffer(
     example = example.set("loc", example["action"]).select(*TRANSITION)
     for key in TRANSITION:
         if key not in transitions.keys(True):
-            raise ArgumentError(f"no entry {key} in the replay buffer; a file of checkpoints/weights-* may still do")
+            raise ArgumentError(
+                f"replay buffer: no entry {key}, expected one; to take over the networks alone, start from a file "
+                "checkpoints/weights-*.pt"
+            )
         got, expected = (entry[key].shape[1:] for entry in (transitions, example))
         if got != expected:
             raise ArgumentError(f"replay buffer, {key}: expected shape {tuple(expected)}, got {tuple(got)}")
     count, size = len(transitions), buffer.storage.max_size
-    order = (torch.arange(count) + state["writer"]["_cursor"]) % count  # a full buffer was written around its end
+    order = (torch.arange(count) + state["writer"]["_cursor"]) % count  # in a full buffer, the oldest is at the cursor
     buffer.extend(transitions.select(*TRANSITION)[order[-size:]].to(device))
 
 
 def load_buffer(buffer: TensorDictReplayBuffer, rng: torch.Generator, state: dict[str, Any]) -> None:
-    """Refill an empty buffer: unlike TorchRL's own, this keeps the storage on its device and in shared memory."""
+    """Restore an empty buffer from its state; unlike TorchRL's method, this keeps its device and its shared memory."""
     if state["transitions"]:
         transitions = TensorDict(state["transitions"]).auto_batch_size_(1)
         buffer.extend(transitions.to(rng.device))

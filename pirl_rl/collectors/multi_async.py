@@ -1,4 +1,4 @@
-"""Worker processes that play while the learner learns."""
+"""Collection in worker processes while the learner learns."""
 
 from __future__ import annotations
 
@@ -26,16 +26,20 @@ from pirl_rl.sampling.initial_states import InitialStates
 
 
 class MultiAsyncCollector:
-    """Worker processes fill a shared buffer while the learner learns; they play on the CPU.
+    """Worker processes on the CPU fill a shared buffer while the learner learns, as in Algorithm 1 of the paper.
 
     Args:
-        env: its `recipe` is rebuilt in each worker, with seeds of its own.
-        actor: copied to the workers every `updates_per_batch` updates.
-        workers: processes.
-        frames_per_batch: transitions a worker delivers at once, a multiple of the environment's batch size.
-        updates_per_batch: updates between two copies.
-        warmup_frames, buffer_size, exploration_noise, exploration, n_steps, seed: as for `SyncCollector`.
-        patience: seconds without a transition until `CollectorError`; a dead worker is noticed at once.
+        env: the environment; each worker builds a copy with its own seed.
+        actor: the learner's actor, copied to the workers every `updates_per_batch` updates.
+        workers: the number of processes.
+        frames_per_batch: transitions that a worker delivers at once, a multiple of the environment's batch size.
+        updates_per_batch: updates between two copies of the actor.
+        warmup_frames, buffer_size, exploration_noise, exploration, n_steps, seed: arguments of `SyncCollector`.
+        patience: seconds without a new transition after which `CollectorError` is raised; for a worker that died it is
+            raised at once.
+
+    Raises:
+        ArgumentError: a number is out of range, or `exploration` is unknown.
     """
 
     def __init__(
@@ -80,7 +84,7 @@ class MultiAsyncCollector:
         return self._exploration.deviation
 
     def play(self, initial_states: InitialStates, n_steps: int, exploration_noise: float) -> None:
-        """Where something changes, the workers start anew."""
+        """See `TransitionCollector.play`; the workers are started again if something changes."""
         other_noise = exploration_noise != self.exploration_noise
         if initial_states is self.initial_states and n_steps == self.n_steps and not other_noise:
             return
@@ -98,12 +102,13 @@ class MultiAsyncCollector:
             fill_buffer(self.buffer, self._rng.device, self._env, buffer)
 
     def start(self) -> None:
-        # A start in the middle of a run is not to repeat the noise of the one before.
+        # The seeds depend on the count of transitions, so that a later start does not repeat the noise of the first.
         seeds = range(first := self._seed + 1 + self.buffer.write_count, first + self._workers)
         recipes = [self._env.recipe(seed) for seed in seeds]
         self._copy = copy.deepcopy(self._actor).cpu()
         self._policy = exploring_policy(self._copy, self._exploration)
-        # A generator's state does not survive the way into a spawned process, nor is a worker to watch itself.
+        # The state of the random generator does not survive being sent to a spawned process, and only the learner's
+        # process watches the workers.
         self.buffer.set_rng(None)
         lock_writes_with(self.buffer, self._write_lock)
         try:
@@ -119,7 +124,9 @@ class MultiAsyncCollector:
                 weight_sync_schemes={"policy": SharedMemWeightSyncScheme(sync=False)},  # type: ignore[call-arg]
             )
         except RuntimeError as error:
-            raise CollectorError(f"rollout workers did not start, see their messages above: {error}") from None
+            raise CollectorError(
+                f"the {self._workers} rollout workers did not start; their messages above say why: {error}"
+            ) from None
         self.buffer.set_rng(self._rng)
         lock_writes_with(self.buffer, _WatchedLock(self._write_lock, self._check_workers))
         self._collector.set_seed(self._seed)
@@ -147,7 +154,11 @@ class MultiAsyncCollector:
         self._exploration.deviation = state["exploration_noise"]
 
     def _check_workers(self) -> None:
-        """TorchRL is silent about dead workers, and may wait for ever for their answer."""
+        """TorchRL does not report workers that died, and may wait for them forever.
+
+        Raises:
+            CollectorError: a worker died, or there was no new transition for `patience` seconds.
+        """
         processes = self._collector.procs
         for index, process in enumerate(processes):
             if not process.is_alive():
@@ -160,11 +171,11 @@ class MultiAsyncCollector:
 
 
 class _WatchedLock:
-    """The lock of a shared buffer, without which nothing is sampled: a worker may die while it holds it.
+    """A lock that checks the workers while it waits, because a worker may die while it holds the lock.
 
     Args:
-        lock: between processes.
-        check: called every second of waiting; raises where there is nothing to wait for.
+        lock: the lock of the shared buffer.
+        check: called after every second of waiting; raises if a worker died.
     """
 
     def __init__(self, lock: Any, check: Callable[[], None]):
@@ -179,7 +190,7 @@ class _WatchedLock:
 
 
 def _worker_env(recipe: Callable[[], ReachAvoidEnv], learner: int) -> ReachAvoidEnv:
-    """An environment in its worker, which leaves Ctrl-C to the learner's process."""
+    """Build the environment in a worker, where SIGINT is ignored, since the learner's process handles it."""
     if os.getpid() != learner:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     return recipe()

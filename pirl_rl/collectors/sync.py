@@ -1,4 +1,4 @@
-"""One vectorised environment in the learner's process."""
+"""Collection in the learner's process."""
 
 from __future__ import annotations
 
@@ -17,20 +17,23 @@ from pirl_rl.sampling.initial_states import InitialStates
 
 
 class SyncCollector:
-    """Collects `frames_per_batch` transitions every `updates_per_batch` updates.
+    """Collects `frames_per_batch` transitions every `updates_per_batch` updates, in the learner's process.
 
     Args:
-        env: played in place.
-        actor: the learner's own, its parameters followed live.
-        frames_per_batch: transitions a batch, a multiple of the environment's batch size.
+        env: the environment.
+        actor: the learner's actor; its current parameters are used.
+        frames_per_batch: transitions of a batch, a multiple of the environment's batch size.
         updates_per_batch: updates between two batches.
-        warmup_frames: transitions before the first update, played by uniformly random actions, or after
-            `warm_start` by the actor.
-        buffer_size: capacity of the replay buffer.
-        exploration_noise: deviation of the noise on actions.
-        exploration: when there is noise, "always" or at the "start" of episodes, see `Exploration`.
-        n_steps: length of returns; use noise at the start only where it is above 1.
-        seed: of the buffer's sampling.
+        warmup_frames: transitions before the first update, with uniformly random actions, or after `warm_start` with
+            those of the actor.
+        buffer_size: capacity of the replay buffer, in transitions.
+        exploration_noise: standard deviation of the noise on actions, which are normalised to [-1, 1].
+        exploration: "always" for noise on every action, "start" for the first of each episode, see `Exploration`.
+        n_steps: the length of returns, in control steps; with `exploration="start"` it should be above 1.
+        seed: the seed of sampling from the buffer.
+
+    Raises:
+        ArgumentError: a number is out of range, or `exploration` is unknown.
     """
 
     def __init__(
@@ -83,7 +86,7 @@ class SyncCollector:
     def warm_start(self, buffer: dict[str, Any] | None) -> None:
         if buffer is not None:
             fill_buffer(self.buffer, self._rng.device, self.env, buffer)
-        # TorchRL's collector then takes its random frames for played; the count is part of the state.
+        # The count of frames is part of the state; after this one, TorchRL's collector plays no more random actions.
         self._load_frames(self._collector.init_random_frames)
 
     def start(self) -> None:
@@ -110,7 +113,7 @@ class SyncCollector:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         load_buffer(self.buffer, self._rng, state["buffer"])
         self._exploration.deviation = state["exploration_noise"]
-        # TorchRL saves no environment state; the carried TensorDict is all that a ReachAvoidEnv has.
+        # TorchRL does not save the state of environments; that of a ReachAvoidEnv is the carried TensorDict.
         self._load_frames(state["frames"])
         carried(self._collector).update(TensorDict(state["carrier"], device=self.env.device))
         restore_rng(self.env.rng, state["env_rng"])
@@ -119,7 +122,7 @@ class SyncCollector:
         self._collector.load_state_dict({**self._collector.state_dict(), "frames": frames})  # type: ignore[arg-type]
 
     def _collect(self) -> None:
-        # TorchRL leaves what the policy wrote before beside a warm-up's random actions.
+        # In the warm-up, TorchRL leaves an earlier output of the actor, "loc", beside the random actions.
         random = plays_at_random(self._collector)
         batch = next(self._batches)
         self.buffer.extend(self._transitions(batch.exclude("loc") if random else batch))

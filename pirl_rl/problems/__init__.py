@@ -1,6 +1,6 @@
-"""Problems shipped with the package, one file each, or one folder where a problem brings more than its physics.
+"""The problems that come with the package, one file each, or one folder if a problem has more than its physics.
 
-They are extensions like a user's own: a configuration names them, and no general module of the package imports them.
+They are extensions like those of a user: a configuration names them, and no general module of the package imports them.
 """
 
 from pirl_rl.problems.drift.problem import VehicleDrift

@@ -1,4 +1,4 @@
-"""One-dimensional reachability, Sec. V-A of the paper: the benchmark whose value is known in closed form."""
+"""One-dimensional reachability, Sec. V-A of the paper: a benchmark whose value is known in closed form."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pirl_rl.sets import Box
 
 
 class Reach1D(ReachAvoidProblem):
-    """dX = u dt + dW with |u| <= 1: reach x >= 2 within T = 2. The optimal control is u = 1."""
+    """dX = u dt + dW with |u| <= 1: reach x >= 2 within T = 2 s. The optimal control is u = 1."""
 
     horizon = 2.0
     states = Box([-2.0], [2.0])
@@ -26,14 +26,15 @@ class Reach1D(ReachAvoidProblem):
         return 2.0 - x[..., 0]
 
     def exact_value(self, tau: Tensor, x: Tensor) -> Tensor:
-        """First-passage probability of Brownian motion with unit drift (Karatzas and Shreve, Sec. 3.5.C).
+        """The probability (*) that Brownian motion with unit drift passes 2 within tau.
 
-        With d = 2 - x: Phi((tau - d)/sqrt(tau)) + exp(2 d) Phi(-(tau + d)/sqrt(tau)), the second term written with
-        erfcx so that neither factor over- nor underflows.
+        It is Phi((tau - d)/sqrt(tau)) + exp(2 d) Phi(-(tau + d)/sqrt(tau)) with d = 2 - x (Karatzas and Shreve,
+        Brownian Motion and Stochastic Calculus, Sec. 3.5.C). The second term is computed with erfcx, so that neither of
+        its factors overflows or underflows.
         """
         d = 2.0 - x[..., 0]
         outside = (d > 0) & (tau > 0)
-        # Absorbed and tau = 0 rows get harmless arguments, so that no NaN enters a gradient through torch.where.
+        # Absorbed states and tau = 0 get other arguments, so that no NaN enters the gradient through torch.where.
         d_safe, tau_safe = torch.where(outside, d, torch.ones_like(d)), torch.where(outside, tau, torch.ones_like(tau))
         scale = torch.sqrt(2 * tau_safe)
         early, late = (d_safe - tau_safe) / scale, (d_safe + tau_safe) / scale

@@ -7,7 +7,7 @@ from pirl_rl.problems.reach1d import Reach1D
 
 
 class Reach1DEnv(ReachAvoidEnv):
-    """The paper's one-dimensional benchmark, Sec. V-A; the arguments are those of `ReachAvoidEnv` but the problem."""
+    """The benchmark of Sec. V-A of the paper. It takes the arguments of `ReachAvoidEnv` except `problem`."""
 
     def __init__(self, **kwargs):
         super().__init__(Reach1D(), **kwargs)

@@ -1,4 +1,4 @@
-"""One-dimensional invariance: the largest probability to stay inside an interval, as in Remark 1 of the paper."""
+"""One-dimensional invariance, Remark 1 of the paper: the largest probability to stay inside an interval."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pirl_rl.sets import Box
 
 
 class Safety1D(ReachAvoidProblem):
-    """dX = u dt + dW with |u| <= 1: stay in |x| < 1 for T = 2. The optimal control is u = -sign(x)."""
+    """dX = u dt + dW with |u| <= 1: stay in |x| < 1 for T = 2 s. The optimal control is u = -sign(x)."""
 
     objective = "invariance"
     horizon = 2.0

@@ -1,1 +1,1 @@
-"""Where states and points come from: starts of episodes, interior points of the PDE, and its boundary."""
+"""Sampling of the initial states of episodes, and of points in the interior and on the boundary of the HJB equation."""

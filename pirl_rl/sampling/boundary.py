@@ -1,6 +1,6 @@
-"""The parabolic boundary: points at tau = 0 and on the faces of A and B, with the value V there.
+"""Points of the parabolic boundary, tau = 0 and the faces of A and B, with the value V of Eq. (parabolic_boundary).
 
-A draw returns a TensorDict of fixed size, so that an update keeps static shapes.
+The number of points of a sample is fixed, so that an update has static shapes.
 """
 
 from __future__ import annotations
@@ -14,29 +14,30 @@ from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.initial_states import sample_interior
 
 FACE_POOL = 16_384
-"""Points on the faces that are found once and drawn from afterwards."""
+"""The number of points on the faces that are found once, and from which samples are drawn."""
 
 BISECTIONS = 50
-"""Halvings of a segment between a point inside a set and one outside: enough for double precision."""
+"""The number of halvings of a segment between a point inside a set and one outside; enough for double precision."""
 
 
 class BoundarySampler:
-    """Points of the parabolic boundary with the value V there: tau = 0, and the faces of A and B at tau in (0, T].
+    """Samples points at tau = 0, and on the faces of A and B at tau in (0, T], with the value V there.
 
-    Faces come from `problem.faces` where it is given; else from a pool found once by bisection of the level functions
-    between points inside and outside, over a box twice as wide as `states`.
+    The points on the faces are drawn from a pool, which `problem.faces` gives. If it gives none, the pool is found by
+    bisection of the level functions between points inside and outside the sets, in a box twice as wide as `states`.
 
     Args:
-        problem: gives sets and values.
-        initial: points a draw at tau = 0, uniform in `states` outside A and B.
-        faces: points a draw on the faces.
-        widen: the box of the points at tau = 0 is wider than `states` by this factor.
-        tau_power: tau = T U^tau_power on the faces, as in `Collocation`.
-        replay_share: share of the points at tau = 0 that are visited states instead.
-        seed: of the pool.
+        problem: gives the sets and the boundary values.
+        initial: the number of points at tau = 0 in a sample; they are uniform outside A and B.
+        faces: the number of points on the faces in a sample.
+        widen: the points at tau = 0 lie in the box `states`, widened by this factor.
+        tau_power: on the faces, tau = T U^tau_power with U uniform, as in `Collocation`.
+        replay_share: the share of the points at tau = 0 that are replaced by visited states.
+        seed: the seed of the pool.
 
     Raises:
-        ProblemError: faces that sampling does not find.
+        ArgumentError: a number is out of range.
+        ProblemError: the problem gives no faces, and bisection finds none.
     """
 
     def __init__(
@@ -63,7 +64,15 @@ class BoundarySampler:
         self._pool = _face_pool(problem, rng)
 
     def sample(self, rng: torch.Generator, replay: TensorDictBase | None = None) -> TensorDict:
-        """{"tau" (N, 1), "state" (N, n), "value" (N,)} with N = initial + faces; `replay` holds the visited states."""
+        """Draw N = initial + faces points.
+
+        Args:
+            rng: the random generator, on whose device the points are.
+            replay: transitions, whose "state" (k, n) are the visited states.
+
+        Returns:
+            A TensorDict with "tau" (N, 1), in s, "state" (N, n) and "value" (N,).
+        """
         device, dtype = rng.device, torch.get_default_dtype()
         state = sample_interior(self.problem, self.box, self.initial, rng, dtype)
         visited = 0 if replay is None else round(self.replay_share * self.initial)
@@ -105,13 +114,13 @@ def _face_pool(problem: ReachAvoidProblem, rng: torch.Generator) -> tuple[Tensor
     if not points:
         raise ProblemError(
             f"{type(problem).__name__}: neither target nor avoid set found among {len(candidates)} points of {wide}; "
-            "give faces(count, rng) for sets this thin"
+            "give faces(count, rng), which is needed for sets this thin"
         )
     return torch.cat(points).to(torch.get_default_dtype()), torch.cat(values).to(torch.get_default_dtype())
 
 
 def _bisect(absorbs, inside: Tensor, outside: Tensor) -> Tensor:
-    """The point of each segment (N, n) from inside to outside at which it leaves the set."""
+    """The points (N, n) at which the segments from points inside to points outside leave the set."""
     for _ in range(BISECTIONS):
         middle = (inside + outside) / 2
         held = absorbs(middle).unsqueeze(-1)

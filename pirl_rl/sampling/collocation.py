@@ -1,7 +1,7 @@
-"""Collocation: the interior points (tau, x) at which the HJB residual is imposed.
+"""Collocation: interior points (tau, x) at which the HJB residual enters the loss.
 
-A sampler returns a TensorDict of fixed size, so that an update keeps static shapes: points that fall inside A or B, or
-that have tau outside (0, T], are masked and not dropped.
+The number of points of a sample is fixed, so that an update has static shapes: points inside A or B, or with tau
+outside (0, T], are masked in place of being dropped.
 """
 
 from __future__ import annotations
@@ -18,14 +18,17 @@ from pirl_rl.problem import ReachAvoidProblem
 
 
 class Collocation:
-    """Points (tau, x) of the box (0, T] x states.
+    """Samples points (tau, x) of the box (0, T] x states.
 
     Args:
         problem: gives the box and the mask.
-        size: points a draw.
-        sampler: "uniform", or "sobol" for scrambled low-discrepancy points.
-        widen: the box's widths are multiplied by this, so that points reach beyond it.
-        tau_power: tau = T U^tau_power; 1 is uniform, 2 puts more points near tau = 0, where V is steep.
+        size: the number of points of a sample.
+        sampler: "uniform" for independent points, or "sobol" for scrambled low-discrepancy points.
+        widen: the widths of the box of states are multiplied by this factor.
+        tau_power: tau = T U^tau_power with U uniform; 1 is uniform, 2 gives more points near tau = 0, where V is steep.
+
+    Raises:
+        ArgumentError: a number is out of range, or `sampler` is unknown.
     """
 
     def __init__(
@@ -46,11 +49,15 @@ class Collocation:
         self.box = problem.states.expand(widen)
 
     def sample(self, rng: torch.Generator, replay: TensorDictBase | None = None, progress: float = 0.0) -> TensorDict:
-        """{"tau" (size, 1), "state" (size, n), "mask" (size,)}.
+        """Draw points.
 
         Args:
-            replay: transitions of the update, for samplers that stay near visited states.
-            progress: of the loss schedule, for samplers that move with it.
+            rng: the random generator, on whose device the points are.
+            replay: the transitions of the update, with "tau" and "state", for samplers that stay near visited states.
+            progress: the progress of the loss schedule in [0, 1], for samplers that change with it.
+
+        Returns:
+            A TensorDict with "tau" (size, 1), in s, "state" (size, n) and "mask" (size,), see `mask`.
         """
         unit = self._unit(rng)
         # 1 - U lies in (0, 1]: tau = 0 belongs to the boundary.
@@ -59,7 +66,7 @@ class Collocation:
         return TensorDict({"tau": tau, "state": state, "mask": self.mask(tau, state)}, batch_size=[self.size])
 
     def mask(self, tau: Tensor, state: Tensor) -> Tensor:
-        """(N,) bool: points where the HJB equation holds."""
+        """Whether Eq. (hjb_pde) is imposed at tau (N, 1) and state (N, n), (N,) bool; not where V is known."""
         t = tau.squeeze(-1)
         known = ~self.problem.interior(state) | self.problem.unreachable(state)
         return ~known & (t > 0) & (t <= self.problem.horizon)
@@ -74,16 +81,19 @@ class Collocation:
 
 
 class ReplayCollocation(Collocation):
-    """Points near those that the policy visits, in the dimensions where a box is mostly empty, and a rest as above.
+    """Samples a share of the points near those that the policy visits, and the others as `Collocation` does.
 
-    A visited (tau, x) is moved by independent normal steps in the coordinates in which (0, T] x states is a cube of
-    width 2. Both the share of such points and the deviation of the steps move with the loss schedule, as in the
-    transition and the refinement stages of the paper.
+    In many dimensions the policy visits only a small part of the box. Visited points (tau, x) are moved by independent
+    normal steps in the coordinates in which (0, T] x states is [-1, 1]^(1 + n). The share of these points and the size
+    of the steps change with the loss schedule, as between the transition and the refinement stage of the paper.
 
     Args:
-        problem, size, sampler, widen, tau_power: as of `Collocation`, for the rest.
-        replay_share: share of points near visited ones, at the schedule's start and end.
-        jitter: deviation of the steps, at the schedule's start and end.
+        problem, size, sampler, widen, tau_power: arguments of `Collocation`, for the other points.
+        replay_share: the share of points near visited ones, at the start and at the end of the schedule.
+        jitter: the standard deviation of the steps, at the start and at the end of the schedule.
+
+    Raises:
+        ArgumentError: a number is out of range, or `sampler` is unknown.
     """
 
     def __init__(
@@ -110,7 +120,8 @@ class ReplayCollocation(Collocation):
         device, horizon = rng.device, self.problem.horizon
         index = torch.randint(len(replay), (self.size,), generator=rng, device=device)
         step = jitter * torch.randn(self.size, 1 + self.problem.states.dim, generator=rng, device=device)
-        # Reflected at both ends of (0, T]: a negative tau has no root, and NaN at a masked point spoils all gradients.
+        # tau is reflected at both ends of (0, T]: the critic takes its root, and NaN would reach the gradient even from
+        # a masked point.
         tau = torch.abs(replay["tau"][index] + step[:, :1] * horizon / 2)
         tau = horizon - torch.abs(horizon - tau)
         state = self.problem.states.denormalize(self.problem.states.normalize(replay["state"][index]) + step[:, 1:])

@@ -1,4 +1,4 @@
-"""Initial states of episodes: x outside A and B, and whole steps to go, so that tau = steps * dt."""
+"""Initial states of episodes: x outside A and B, and a whole number of control steps to go, so that tau = steps dt."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sets import Box
 
 ATTEMPTS = 1_000
+"""How often states inside A or B are drawn again."""
+
 Tau = Literal["fixed", "random", "both"]
 
 
 @runtime_checkable
 class InitialStates(Protocol):
-    """The law of episodes' starts."""
+    """A distribution of the initial states of episodes."""
 
     def sample(
         self,
@@ -29,25 +31,36 @@ class InitialStates(Protocol):
         dtype: torch.dtype,
         visited: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Steps to go (count,), int64 in [1, max_steps], and states (count, n) outside A and B.
+        """Draw initial states.
 
         Args:
-            visited: states (k, n) on the paths that are being played, where there are any.
+            problem: gives the sets and the box of states.
+            count: the number of initial states.
+            max_steps: the number of control steps in the horizon.
+            rng: the random generator, on whose device the results are.
+            dtype: the dtype of the states.
+            visited: states (k, n) of the paths that are under way, if there are any.
+
+        Returns:
+            Control steps to go (count,), int64 in [1, max_steps], and states (count, n) outside A and B.
 
         Raises:
-            ProblemError: where no state outside A and B is found.
+            ProblemError: no state outside A and B is found.
         """
         ...
 
 
 class UniformStates:
-    """x uniform in a box, redrawn until outside A and B.
+    """States uniform in the part of a box outside A and B.
 
     Args:
-        low: lower corner of the box; default the problem's `states`.
-        high: upper corner.
-        tau: "fixed" starts every episode at the whole horizon, "random" at a uniform number of steps from 1, "both"
-            half of the episodes each.
+        low: lower corner of the box, n numbers; by default the box is `states` of the problem.
+        high: upper corner of the box, n numbers.
+        tau: "fixed" gives every episode the whole horizon, "random" a uniform number of control steps from 1 to that,
+            "both" chooses between the two with equal probability.
+
+    Raises:
+        ArgumentError: only one corner is given, the corners are no box, or `tau` is unknown.
     """
 
     def __init__(
@@ -58,7 +71,7 @@ class UniformStates:
     ):
         check_tau(tau)
         if (low is None) != (high is None):
-            raise ArgumentError("initial_states: give both low and high, or neither")
+            raise ArgumentError(f"initial_states: give both low and high, or neither; got low={low}, high={high}")
         self.box = None if low is None or high is None else Box(low, high)
         self.tau: Tau = tau
 
@@ -76,16 +89,19 @@ class UniformStates:
 
 
 class VisitedStates:
-    """A share of the starts near states that the batch of paths has just come to, the rest from another law.
+    """States near those that other paths of the batch are in, mixed with states from another distribution.
 
-    Starts thus spread along the paths of the current policy. A visited state is moved in a random direction of the
-    coordinates in which `problem.states` is [-1, 1]^n; one that then lies in A or B, or is known as unreachable, is
-    replaced by one of the other law.
+    Initial states thus spread along the paths of the current policy. A visited state is moved in a random direction in
+    the coordinates in which `problem.states` is [-1, 1]^n. If it then lies in A or B or is unreachable, a state from
+    the other distribution takes its place.
 
     Args:
-        others: law of the rest, and of tau for all.
-        share: of visited states.
-        radius: largest length of the move, uniform in [0, radius].
+        others: the other distribution, which also gives the steps to go of all episodes.
+        share: the probability of a visited state, in [0, 1].
+        radius: the length of the move is uniform in [0, radius].
+
+    Raises:
+        ArgumentError: a number is out of range.
     """
 
     def __init__(self, others: InitialStates, share: float = 0.5, radius: float = 0.4):
@@ -114,18 +130,24 @@ class VisitedStates:
 
 
 def moved(z: Tensor, radius: float, rng: torch.Generator) -> Tensor:
-    """Points (N, d), each moved in a random direction by a length uniform in [0, radius]."""
+    """The points z (N, d), each moved in a random direction by a length uniform in [0, radius]."""
     direction = torch.randn(z.shape, generator=rng, dtype=z.dtype, device=z.device)
     length = radius * torch.rand((len(z), 1), generator=rng, dtype=z.dtype, device=z.device)
     return z + length * direction / direction.norm(dim=-1, keepdim=True)
 
 
 def check_tau(tau: str) -> None:
+    """Refuse an unknown rule for the steps to go.
+
+    Raises:
+        ArgumentError: `tau` is not "fixed", "random" or "both".
+    """
     if tau not in get_args(Tau):
         raise ArgumentError(f"initial_states.tau: expected 'fixed', 'random' or 'both', got {tau!r}")
 
 
 def steps_to_go(tau: Tau, count: int, max_steps: int, rng: torch.Generator) -> Tensor:
+    """Control steps to go (count,), int64 in [1, max_steps], by a rule of `UniformStates`."""
     if tau == "fixed":
         return torch.full((count,), max_steps, device=rng.device)
     steps = torch.randint(1, max_steps + 1, (count,), generator=rng, device=rng.device)
@@ -140,16 +162,21 @@ def sample_interior(
     """States (count, n), uniform in the part of a box outside A and B.
 
     Raises:
-        ProblemError: where no such state is found.
+        ProblemError: no such state is found.
     """
     return redrawn(problem, count, lambda missing: box.sample(missing, rng, dtype, rng.device))
 
 
 def redrawn(problem: ReachAvoidProblem, count: int, draw: Callable[[int], Tensor]) -> Tensor:
-    """States (count, n), those of `draw` inside A or B drawn again.
+    """States (count, n) outside A and B.
+
+    Args:
+        problem: gives the sets.
+        count: the number of states.
+        draw: draws the given number of states; states inside A or B are drawn again.
 
     Raises:
-        ProblemError: where no other state is found.
+        ProblemError: states inside A or B remain after `ATTEMPTS` draws.
     """
     x = draw(count)
     for _ in range(ATTEMPTS):

@@ -1,1 +1,1 @@
-"""Vehicle drifting, Sec. V-B of the paper: everything that is about this car and nothing else."""
+"""Vehicle drifting, Sec. V-B of the paper, and a model of it in three states."""

@@ -7,8 +7,10 @@ from pirl_rl.problems.drift.problem import VehicleDrift
 
 
 class DriftEnv(ReachAvoidEnv):
-    """The paper's vehicle drifting, Sec. V-B. Exits are watched at the ends of sub-steps, since a Brownian bridge over
-    the 17 faces of its sets costs more than shorter steps do. The other arguments are those of `ReachAvoidEnv`.
+    """The drifting vehicle of Sec. V-B of the paper. It takes the arguments of `ReachAvoidEnv` except `problem`.
+
+    By default exits are detected at the ends of sub-steps, since Brownian bridges for the 17 faces of the sets cost
+    more than shorter sub-steps.
     """
 
     def __init__(self, crossing: str = "endpoint", **kwargs):

@@ -1,4 +1,4 @@
-"""Drift equilibria of the single-track model on a path of constant curvature, one for each friction."""
+"""Drift equilibria of the single-track model on a path of constant curvature, as functions of friction."""
 
 from __future__ import annotations
 
@@ -16,18 +16,21 @@ from pirl_rl.problems.drift.vehicle import accelerations
 DEGREE = math.pi / 180
 SPEED = 8.0  # m/s, v_x of the equilibria
 CURVATURE = 0.600 * math.cos(-20.44 * DEGREE) / SPEED  # 1/m, of the path
-FRICTION_BAND = (0.5, 0.6)
-KNOTS = 513
+FRICTION_BAND = (0.5, 0.6)  # the friction coefficients whose equilibria are targets
+KNOTS = 513  # of the interpolated curves over this band
 
 
 def equilibrium(friction: float) -> tuple[np.ndarray, np.ndarray]:
-    """State (e_y, e_psi, v_x, v_y, r, delta, mu), (7,), and control (delta', F_x), (2,), to the accuracy of a root.
+    """The drift equilibrium at a friction coefficient.
 
-    v_x = 8 m/s, e_y = 0 and e_psi = -beta are given, so that the car follows the path where r = curvature v_x / cos
-    beta; beta, delta and F_x solve v_x' = v_y' = r' = 0.
+    v_x = 8 m/s, e_y = 0 and e_psi = -beta are given, and the car follows the path if r = curvature v_x / cos(beta). A
+    root finder solves v_x' = v_y' = r' = 0 for beta, delta and F_x.
+
+    Returns:
+        The state (e_y, e_psi, v_x, v_y, r, delta, mu) (7,) and the control (delta', F_x) (2,), in SI units.
 
     Raises:
-        ArithmeticError: where the root finder does not converge.
+        ArithmeticError: the root finder does not converge.
     """
 
     def point(unknown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -41,18 +44,21 @@ def equilibrium(friction: float) -> tuple[np.ndarray, np.ndarray]:
 
     found = root(residual, [-20.44 * DEGREE, -12 * DEGREE, 2.293], tol=1e-14)
     if np.abs(found.fun).max() > 1e-9:
-        raise ArithmeticError(f"no drift equilibrium found at friction {friction}: residual {found.fun}")
+        raise ArithmeticError(
+            f"no drift equilibrium found at friction {friction}: expected residuals <= 1e-9, got {found.fun}"
+        )
     return point(found.x)
 
 
 class EquilibriumCurves:
-    """beta, r, delta, each (*), of the equilibrium at friction (*), at the band's edge outside it.
+    """beta, r and delta (*), in rad, rad/s and rad, of the equilibrium at friction (*), clamped to the band.
 
-    Linear between knots, to 3e-7: the rear tyre slides in all the band, so the curves are smooth.
+    They are interpolated linearly between knots, with errors of at most 3e-7: the rear tyre slides in the whole band,
+    so the curves are smooth.
     """
 
     def __init__(self):
-        # Solved here: a transform of torch.func, in which the curves may first be asked for, lets nothing out to scipy.
+        # Solved here, because the first call may be inside a transform of torch.func, where scipy cannot be used.
         table = torch.from_numpy(_table())
         self._tables: dict[tuple[torch.dtype, torch.device], Tensor] = {(table.dtype, table.device): table}
 
@@ -69,9 +75,10 @@ class EquilibriumCurves:
 
 @cache
 def _table() -> np.ndarray:
-    """beta, r, delta at KNOTS equidistant frictions of the band, (KNOTS, 3).
+    """beta, r and delta at equidistant frictions of the band, (KNOTS, 3).
 
-    A spline through every eighth of them: tenths of a second in place of seconds, for an error of 3e-8.
+    Only every eighth equilibrium is solved, and a cubic spline gives the others, with errors of 3e-8. This takes tenths
+    of a second in place of seconds.
     """
     knots = np.linspace(*FRICTION_BAND, KNOTS)
     solved = np.stack([equilibrium(friction)[0] for friction in knots[::8]])

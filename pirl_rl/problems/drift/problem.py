@@ -1,8 +1,9 @@
 """Vehicle drifting, Sec. V-B of the paper: bring a sliding car into the neighbourhood of an unstable drift equilibrium.
 
-State x = (e_y, e_psi, v_x, v_y, r, delta, mu): lateral (m) and course error (rad) to a path of constant curvature,
-velocities in the body frame (m/s), yaw rate (rad/s), steering angle (rad), friction (constant along a path). Control
-u = (delta', F_x): steering rate (rad/s), drive force (N).
+The state is x = (e_y, e_psi, v_x, v_y, r, delta, mu): the lateral error (m) and the course error (rad) from a path of
+constant curvature, the velocities in the body frame (m/s), the yaw rate (rad/s), the steering angle (rad), and the
+friction coefficient, which does not change with time. The control is u = (delta', F_x): the steering rate (rad/s) and
+the drive force (N).
 """
 
 from __future__ import annotations
@@ -18,20 +19,25 @@ from pirl_rl.problems.drift import vehicle
 from pirl_rl.problems.drift.equilibria import CURVATURE, DEGREE, FRICTION_BAND, SPEED, EquilibriumCurves
 from pirl_rl.sets import Box, Plane, band
 
-FRICTION_RANGE = (0.25, 1.05)
+FRICTION_RANGE = (0.25, 1.05)  # the friction coefficients outside of B
 
 
 class VehicleDrift(ReachAvoidProblem):
-    """Reach the drift equilibrium of the state's own friction within T = 5 s, before the car leaves lane or limits."""
+    """Reach the drift equilibrium for the friction of the state within T = 5 s, before the car leaves lane or limits.
+
+    Args:
+        payoff: replaces the indicator of the target.
+        horizon: replaces the horizon, in s.
+    """
 
     horizon = 5.0
     states = Box([-2.0, -0.8, 4.0, -8.0, -2.5, -0.7, 0.5], [2.0, 0.8, 12.0, 8.0, 2.5, 0.7, 0.6])
     controls = Box([-1.5, 1000.0], [1.5, 5000.0])
     tolerances = {"e_y": 0.2, "e_psi": 4 * DEGREE, "v_x": 0.5, "beta": 4 * DEGREE, "r": 0.2, "delta": 10 * DEGREE}
-    limits = {"e_y": 2.0, "e_psi": 0.8, "v_y": 12.0, "r": 2.5, "delta": 0.7}  # of absolute values, outside of B
-    speeds = (3.0, 25.0)  # m/s, of v_x outside of B
-    friction_band = FRICTION_BAND  # where equilibria are targets
-    noise = (0.03, 0.015, 0.20, 0.20, 0.05, 0.01)  # per sqrt(s); friction has none
+    limits = {"e_y": 2.0, "e_psi": 0.8, "v_y": 12.0, "r": 2.5, "delta": 0.7}  # of absolute values; B is beyond
+    speeds = (3.0, 25.0)  # m/s, the range of v_x outside of B
+    friction_band = FRICTION_BAND
+    noise = (0.03, 0.015, 0.20, 0.20, 0.05, 0.01)  # of the states but friction, in their units per sqrt(s)
 
     def __init__(self, payoff: Payoff | None = None, horizon: float | None = None):
         super().__init__(payoff, horizon)
@@ -44,7 +50,7 @@ class VehicleDrift(ReachAvoidProblem):
         demand = demand.clamp(self.controls.low[1], self.controls.high[1])
         sin_psi, cos_psi = e_psi.sin(), e_psi.cos()
         across, along = v_x * sin_psi + v_y * cos_psi, v_x * cos_psi - v_y * sin_psi
-        # Rows first: each derivative stays contiguous in memory.
+        # Stacked along the first axis, so that each coordinate stays contiguous in memory.
         rates = [
             across,
             r - CURVATURE * along / (1 - CURVATURE * e_y).clamp(min=0.2),
@@ -71,7 +77,7 @@ class VehicleDrift(ReachAvoidProblem):
             band(torch.atan2(v_y, v_x.clamp(min=vehicle.LEAST_SPEED)), beta, tolerance["beta"]),
             band(r, yaw, tolerance["r"]),
             band(delta, steering, tolerance["delta"]),
-            torch.maximum(low - friction, friction - high),  # unlike `band`, without rounding at the band's edges
+            torch.maximum(low - friction, friction - high),  # `band` would round at the edges
         ]
         return torch.stack(bands).movedim(0, -1)
 
@@ -93,7 +99,7 @@ class VehicleDrift(ReachAvoidProblem):
         return torch.stack(bounds).movedim(0, -1)
 
     def unreachable(self, x: Tensor) -> Tensor:
-        """Friction stays as it is, and no equilibrium is a target outside the band."""
+        """States (*, n) with friction outside the band, (*) bool: friction is constant, and there is no target."""
         low, high = self.friction_band
         return (x[..., 6] < low) | (x[..., 6] > high)
 
@@ -105,7 +111,7 @@ class VehicleDrift(ReachAvoidProblem):
         beta: Tensor | None = None,
         r: Tensor | None = None,
     ) -> Tensor:
-        """States (N, 7) at v_x = 8 m/s, each entry (N,) that is not given at the equilibrium of its friction (N,)."""
+        """States (N, 7) with v_x = 8 m/s and the given entries (N,); the others are those of the equilibrium."""
         sideslip, yaw, steering = self.equilibrium_curves(friction)
         beta = sideslip if beta is None else beta
         rows = [
@@ -120,11 +126,11 @@ class VehicleDrift(ReachAvoidProblem):
         return torch.stack(rows).movedim(0, -1)
 
     def faces(self, count: int, rng: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
-        """Half of the points on the target's faces, half on those of the avoid set, at friction inside the band.
+        """Points (count, 7) and values (count,): half on the faces of A, half on those of B, with friction in the band.
 
-        Only where all vertex controls drive the car into the set: there V is continuous. Where it can leave a face, V
-        jumps within a layer of less than a centimetre or its like, since the noise is weak: data there would teach a
-        network that cannot see the layer the wrong value of its surroundings.
+        The points are those where every vertex of the box of controls drives the car into the set, so that V is
+        continuous. Elsewhere V jumps at the face within a thin layer, less than a centimetre in e_y, since the noise is
+        weak. A network cannot resolve the layer, and boundary values there would teach it a wrong V nearby.
         """
         target = _drawn(lambda n: self._target_faces(n, rng), lambda x: self._enters(x, self.reached), count // 2)
         rest = count - count // 2
@@ -134,7 +140,7 @@ class VehicleDrift(ReachAvoidProblem):
 
     @property
     def planes(self) -> dict[str, Plane]:
-        """The sections of the paper's figures: through the equilibrium at friction 0.55."""
+        """The sections in the figures of the paper, through the equilibrium at friction 0.55."""
 
         def states(**coordinates: Tensor) -> Tensor:
             first = next(iter(coordinates.values()))
@@ -156,7 +162,7 @@ class VehicleDrift(ReachAvoidProblem):
         }
 
     def _target_faces(self, count: int, rng: torch.Generator | None) -> Tensor:
-        """Points of the target with one of its six bounded coordinates at its bound."""
+        """Points (count, 7) of the target with one of its coordinates but friction at its bound."""
         unit = 2 * torch.rand(count, 7, generator=rng, dtype=torch.float64) - 1
         side = torch.randint(6, (count,), generator=rng)
         rows = torch.arange(count)
@@ -170,7 +176,7 @@ class VehicleDrift(ReachAvoidProblem):
         return torch.stack([*columns, yaw + offset[:, 4], steering + offset[:, 5], friction], -1)
 
     def _avoid_faces(self, count: int, rng: torch.Generator | None) -> Tensor:
-        """Points of the envelope with one bound met; bounds outside `states` are left out."""
+        """Points (count, 7) at one of the bounds outside of which B lies; bounds beyond `states` are omitted."""
         x = self.states.sample(count, rng, dtype=torch.float64)
         side = torch.randint(5, (count,), generator=rng)
         sign = torch.where(torch.rand(count, generator=rng, dtype=torch.float64) < 0.5, -1.0, 1.0).double()
@@ -181,7 +187,7 @@ class VehicleDrift(ReachAvoidProblem):
         return x
 
     def _enters(self, x: Tensor, absorbs) -> Tensor:
-        """(N,) bool: from just outside the set, a short step of every vertex control ends inside, and none before."""
+        """Whether every vertex of the box of controls drives the states (N, 7) from outside into the set, (N,) bool."""
         corners = torch.cartesian_prod(*torch.tensor([self.controls.low, self.controls.high], dtype=x.dtype).mT)
         step = 1e-5
         inside = [absorbs(x + step * self.drift(x, corner.expand(len(x), 2))) for corner in corners]
@@ -190,7 +196,7 @@ class VehicleDrift(ReachAvoidProblem):
 
 
 def _drawn(draw, keep, count: int) -> Tensor:
-    """Exactly `count` of the drawn points that are kept."""
+    """`count` of the points of `draw` for which `keep` is true."""
     x = draw(2 * count)
     found = x[keep(x)]
     while len(found) < count:

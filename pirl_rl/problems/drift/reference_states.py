@@ -1,4 +1,4 @@
-"""The reference states of the drifting problem, and the recipe behind them."""
+"""The states at which values for the drifting vehicle are compared, and how they are made."""
 
 from __future__ import annotations
 
@@ -15,13 +15,22 @@ from pirl_rl.simulator import Simulator
 
 FILE = Path(__file__).with_name("reference_states.npz")
 NETWORK_BOX = Box([0, -2, -0.8, 3, -12, -2.5, -0.7, 0.25], [5, 2, 0.8, 25, 12, 2.5, 0.7, 1.05])
-"""Of (tau, x): the [-1, 1] coordinates of the paper's networks, wider than `VehicleDrift.states`."""
+"""The box of (tau, x) that the networks of the paper scale to [-1, 1]^8, wider than `VehicleDrift.states`."""
 EPISODES = 1_024
+"""The number of episodes whose states are visited."""
 
 
 def drift_states(policy: Policy, seed: int = 0) -> ReferenceStates:
-    """The paper's recipe for any policy: 1,024 noise-free episodes from the paper's full-scale training starts, steps
-    to go random, the paper's simulator (Euler steps of 0.1 s, exits at end points)."""
+    """Make reference states as the paper does, from the states that a policy visits.
+
+    The policy plays 1,024 episodes without exploration noise. They start from `EquilibriumStates` in the whole boxes,
+    with a random number of steps to go, and are simulated as in the paper: Euler-Maruyama steps of 0.1 s, and exits at
+    their ends.
+
+    Args:
+        policy: maps tau (N,), in s, and x (N, 7) to controls (N, 2), in SI units.
+        seed: the seed of the episodes and of the choice of states.
+    """
     problem, rng = VehicleDrift(), torch.Generator().manual_seed(seed)
     simulator = Simulator(problem, dt=0.1, substeps=1, crossing="endpoint")
     tau, x = visited_by(simulator, policy, EquilibriumStates(), EPISODES, rng)
@@ -32,21 +41,22 @@ class DriftStates:
     """Gives the reference states.
 
     Args:
-        run: directory of a run whose policy visits them; default the committed set, visited by the paper's TD3 policy
-            of random horizon.
+        run: directory of a run whose policy visits the states; by default the states are those in the package, which
+            the TD3 policy of the paper with random horizon visited.
     """
 
     def __init__(self, run: str | None = None):
         self.run = run
 
     def __call__(self) -> ReferenceStates:
-        """
+        """Read or make the reference states.
+
         Raises:
-            ConfigError: not a run directory, or one of another problem.
+            ConfigError: `run` is not a run directory, or its problem is another one.
         """
         if self.run is None:
             return ReferenceStates.load(FILE)
-        # Runs build evaluators, this one among them.
+        # Imported here, because opening a run builds its evaluators, which may use this class.
         from pirl_rl.configuration import ConfigError
         from pirl_rl.runs.load import load_run
 

@@ -1,4 +1,4 @@
-"""Where the drifting car's episodes start."""
+"""Initial states of the episodes of the drifting vehicle."""
 
 from __future__ import annotations
 
@@ -13,16 +13,20 @@ from pirl_rl.sampling.initial_states import Tau, check_tau, redrawn, steps_to_go
 
 
 class EquilibriumStates:
-    """Around the drift equilibrium of a random friction: states displaced in some of the problem's planes.
+    """States around the drift equilibrium at a random friction, displaced in planes of the problem.
 
-    Friction is uniform in the band of the targets. A state lies in one of the two planes, beta-r or e_y-e_psi, or is
-    displaced in all four coordinates; these are uniform in the planes' boxes, contracted towards the equilibrium. The
-    other entries are those of the equilibrium.
+    Friction is uniform in the band of the targets. A state is displaced in the beta-r plane, in the e_y-e_psi plane, or
+    in both. The displaced coordinates are uniform in the boxes of the planes, contracted towards the equilibrium; the
+    others are those of the equilibrium.
 
     Args:
-        scale: 1 is the whole box, 0 the equilibrium; of two numbers, each start draws its own between them.
-        mixture: shares of the beta-r plane, the e_y-e_psi plane, and both together.
-        tau: as of `UniformStates`.
+        scale: factor of the contraction, where 1 gives the whole box and 0 the equilibrium. For two numbers, each state
+            draws its factor uniformly between them.
+        mixture: shares of the states displaced in the beta-r plane, in the e_y-e_psi plane, and in both.
+        tau: the rule for the steps to go, as in `UniformStates`.
+
+    Raises:
+        ArgumentError: `scale` or `mixture` is out of range, or `tau` is unknown.
     """
 
     def __init__(

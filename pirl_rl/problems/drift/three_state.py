@@ -1,7 +1,7 @@
-"""Drifting in three states, after Hindiyeh and Gerdes, J. Dyn. Sys. Meas. Control 136 (2014): small enough for a grid.
+"""Vehicle drifting in three states, few enough for a grid (Hindiyeh and Gerdes, J. Dyn. Sys. Meas. Control 136, 2014).
 
-State x = (beta, r, v_x): sideslip angle (rad), yaw rate (rad/s), longitudinal velocity (m/s). Control u = (delta, F_x):
-steering angle (rad), drive force (N).
+The state is x = (beta, r, v_x): the sideslip angle (rad), the yaw rate (rad/s) and the longitudinal velocity (m/s). The
+control is u = (delta, F_x): the steering angle (rad) and the drive force (N).
 """
 
 from __future__ import annotations
@@ -20,28 +20,30 @@ from pirl_rl.problems.drift.equilibria import DEGREE, SPEED
 from pirl_rl.problems.drift.problem import VehicleDrift
 from pirl_rl.sets import Box, Plane, band
 
-STEERING = -12 * DEGREE  # rad, delta of the published equilibrium
+STEERING = -12 * DEGREE  # rad, delta of the equilibrium in the article
 
 
 class VehicleDrift3(ReachAvoidProblem):
     """Reach the drift equilibrium within T = 5 s, before the car spins, stops or runs away.
 
     Args:
-        friction: of both axles, fixed.
+        payoff: replaces the indicator of the target.
+        horizon: replaces the horizon, in s.
+        friction: the friction coefficient of both axles.
 
     Attributes:
-        equilibrium: state (3,) and control (2,), in the middle of the target.
+        equilibrium: the state (3,) in the middle of the target, and its control (2,).
 
     Raises:
-        ArithmeticError: no equilibrium at this friction.
+        ArithmeticError: no equilibrium is found at this friction.
     """
 
     horizon = 5.0
     states = Box([-math.pi / 4, -2.5, 4.0], [math.pi / 4, 2.5, 12.0])
     controls = Box([-0.7, 1000.0], [0.7, 5000.0])
     tolerances = {name: VehicleDrift.tolerances[name] for name in ("beta", "r", "v_x")}
-    # Per sqrt(s). That of v_y, 0.20 m/s, moves beta = atan2(v_y, v_x) by 0.20 cos(beta)^2 / v_x; it is taken at
-    # beta = 0 and the equilibrium's v_x, so that sigma stays constant.
+    # In units of the state per sqrt(s). Noise of 0.20 m/s in v_y is noise of 0.20 cos(beta)^2 / v_x in
+    # beta = atan2(v_y, v_x). It is taken at beta = 0 and at v_x of the equilibrium, so that sigma is constant.
     noise = (VehicleDrift.noise[3] / SPEED, VehicleDrift.noise[4], VehicleDrift.noise[2])
 
     def __init__(self, payoff: Payoff | None = None, horizon: float | None = None, friction: float = 0.55):
@@ -50,7 +52,7 @@ class VehicleDrift3(ReachAvoidProblem):
         self.equilibrium = equilibrium(self)
 
     def drift(self, x: Tensor, u: Tensor) -> Tensor:
-        """As published, F_yf enters v_y' and r' without cos(delta)."""
+        """f (*, 3), in units of the state per s. As in the article, F_yf enters v_y' and r' without cos(delta)."""
         beta, r, v_x = x.unbind(-1)
         delta, demand = u.unbind(-1)
         v_x, tan_beta = v_x.clamp(min=vehicle.LEAST_SPEED), beta.tan()
@@ -61,7 +63,7 @@ class VehicleDrift3(ReachAvoidProblem):
         along = (drive - front * delta.sin()) / vehicle.MASS + v_y * r
         across = (rear + front) / vehicle.MASS - v_x * r
         rates = [
-            (across - tan_beta * along) * beta.cos() ** 2 / v_x,  # of atan2(v_y, v_x)
+            (across - tan_beta * along) * beta.cos() ** 2 / v_x,  # beta' with beta = atan2(v_y, v_x)
             (vehicle.FRONT_ARM * front - vehicle.REAR_ARM * rear) / vehicle.YAW_INERTIA,
             along,
         ]
@@ -83,7 +85,7 @@ class VehicleDrift3(ReachAvoidProblem):
 
     @property
     def planes(self) -> dict[str, Plane]:
-        """The beta-r section at the equilibrium's v_x."""
+        """The beta-r section at v_x of the equilibrium."""
         beta_r = Plane(
             ("sideslip beta (rad)", "yaw rate r (rad/s)"),
             Box(self.states.low[:2], self.states.high[:2]),
@@ -94,10 +96,10 @@ class VehicleDrift3(ReachAvoidProblem):
 
 
 def equilibrium(problem: VehicleDrift3) -> tuple[np.ndarray, np.ndarray]:
-    """The drift equilibrium at v_x = 8 m/s and delta = -12 degrees: state (3,) and control (2,).
+    """The state (3,) and control (2,), in SI units, of the drift equilibrium at v_x = 8 m/s and delta = -12 degrees.
 
     Raises:
-        ArithmeticError: where the root finder does not converge, or F_x is not admissible.
+        ArithmeticError: the root finder does not converge, or the control is not admissible.
     """
 
     def point(unknown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -112,6 +114,7 @@ def equilibrium(problem: VehicleDrift3) -> tuple[np.ndarray, np.ndarray]:
     x, u = point(found.x)
     if np.abs(found.fun).max() > 1e-9 or not problem.controls.contains(torch.from_numpy(u)):
         raise ArithmeticError(
-            f"no drift equilibrium found at friction {problem.friction}: residual {found.fun}, control {u}"
+            f"no drift equilibrium found at friction {problem.friction}: expected residuals <= 1e-9 and an admissible "
+            f"control, got {found.fun} and {u}"
         )
     return x, u
