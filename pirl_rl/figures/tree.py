@@ -68,7 +68,7 @@ def draw_tree(nodes: Sequence[Node], columns: Sequence[str], title: str) -> Figu
 
 
 def _places(nodes: Sequence[Node]) -> dict[tuple[str, int], Place]:
-    """Centres (x, y) of nodes, by (name, -1), and of lanes, in which edges from a node pass a column, by (name, column).
+    """Centres (x, y) of nodes, by (name, -1), and of the lanes of edges that pass a column, by (origin, column).
 
     The entries of a column are sorted by the height at which their edges start, so that few edges cross.
     """
