@@ -26,8 +26,8 @@ from pirl_rl.commands.console import named_modules, quiet_libraries, reported
 from pirl_rl.configuration import CONF, build, convert
 from pirl_rl.errors import INTERRUPTED, ConfigError
 from pirl_rl.files import replacing
-from pirl_rl.outer_loop.candidates import LEADING, Task, overrides, quoted
-from pirl_rl.outer_loop.directory import KEPT, check, locked
+from pirl_rl.outer_loop.candidates import LEADING, Task, quoted, training_overrides
+from pirl_rl.outer_loop.directory import SETTINGS_FILE, check_directory, locked
 from pirl_rl.outer_loop.history import Result, tolerance
 from pirl_rl.outer_loop.loop import Loop, LoopSettings
 from pirl_rl.outer_loop.plan import START, Candidate
@@ -67,11 +67,11 @@ def tune(config: DictConfig) -> None:
         trainer, path, final = _first(config, train, trust)
         config.start = str(path)
         kept = redact(OmegaConf.to_container(config, resolve=True))
-        check(out, kept)
+        check_directory(out, kept)
         with locked(out) as lock:
-            check(out, kept)
-            if not (out / KEPT).exists():
-                with replacing(out / KEPT) as file:
+            check_directory(out, kept)
+            if not (out / SETTINGS_FILE).exists():
+                with replacing(out / SETTINGS_FILE) as file:
                     file.write(OmegaConf.to_yaml(OmegaConf.create(kept)))
             record = Record(out)
             baseline = record.baseline()
@@ -91,9 +91,9 @@ def report(out: Path) -> None:
     """Draw what there is of a loop, finished or not."""
     with reported(out):
         RunDirectory(out).refuse_links()
-        if not (out / KEPT).is_file():
-            raise ConfigError(f"out: {out} is no loop's directory, expected {KEPT} in it")
-        settings = OmegaConf.to_container(OmegaConf.load(out / KEPT), resolve=False)
+        if not (out / SETTINGS_FILE).is_file():
+            raise ConfigError(f"out: expected a directory with {SETTINGS_FILE}, which a loop writes, got {out}")
+        settings = OmegaConf.to_container(OmegaConf.load(out / SETTINGS_FILE), resolve=False)
         _report(out, Path(str(settings["start"])))  # type: ignore[index, call-overload]
 
 
@@ -155,8 +155,8 @@ def _first(config: DictConfig, train: Sequence[str], trust: Sequence[str]) -> tu
     final = [name for name in JUDGES if isinstance(config.evaluation.get(name), DictConfig)]
     if not {"success", "calibration"} <= {*final}:
         raise ConfigError(f"evaluation: expected success and calibration, to judge candidates by, got {final}")
-    candidate = compose("train", [*LEADING, *train, *overrides(_example(config, Path(start)), final, config.seed)])
-    trainer = make_trainer(candidate, None, trust)
+    own = training_overrides(_example(config, Path(start)), final, config.seed)
+    trainer = make_trainer(compose("train", [*LEADING, *train, *own]), None, trust)
     return trainer, start_from(trainer, start), final
 
 
