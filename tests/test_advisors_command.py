@@ -157,7 +157,7 @@ def test_a_program_s_secrets_are_not_told(program, folder, monkeypatch):
         ("agent {prompt}", r"expected \{plan\}"),
         ("", r"expected \{plan\}"),
         ("agent 'open {plan}", "No closing quotation"),
-        ("no-such-program-here {plan}", "no program no-such-program-here"),
+        ("no-such-program-here {plan}", "expected an executable program, got no-such-program-here"),
     ],
 )
 def test_lines_that_are_no_command(command, message):
