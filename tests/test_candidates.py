@@ -8,14 +8,13 @@ import signal
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from rounds import BASE, QUIET, candidate, write_json
 from small import small_trainer
 
 from pirl_rl.assembly import start_from
 from pirl_rl.commands.baseline import measure
-from pirl_rl.configuration import CONF
+from pirl_rl.commands.composition import compose
 from pirl_rl.errors import ConfigError
 from pirl_rl.outer_loop.candidates import Task, make_job, quoted, read_result, settle, training_overrides
 from pirl_rl.outer_loop.history import Result
@@ -30,8 +29,7 @@ def make_task(folder: Path, one: Candidate | None = None, start: Result = BASE) 
 
 def test_command_composes_to_the_plan(tmp_path):
     task = make_task(tmp_path, candidate(collocation_jitter=0.05))
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("train", ["+experiment=drift", "seed=9", *training_overrides(task, ["success"], 7)])
+    config = compose("train", ["+experiment=drift", "seed=9", *training_overrides(task, ["success"], 7)])
     assert config.schedule._target_ == "pirl_rl.schedules.LossSchedule"
     assert (config.schedule.initial, config.schedule.final) == ([1.0, 0.1, 1.0], [1.0, 0.2, 2.0])
     assert (config.schedule.center, config.schedule.steepness) == (50.0, 0.1)
@@ -79,21 +77,17 @@ def test_weights_in_force_at_the_end(tmp_path):
     write_json(task.folder / "summary.json", {"updates": 100, "wall_seconds": 3.0, **QUIET, "td_loss": float("nan")})
     done = read_result(task)
     assert (done.status, done.checkpoint, done.updates, done.metrics) == ("done", "001/a", 100, QUIET)
-    assert (
-        done.weights == LossSchedule((1.0, 0.1, 1.0), (1.0, 0.2, 2.0), 99.0, 0.1)(99) == (1.0, 0.15000000000000002, 1.5)
-    )
+    schedule = LossSchedule((1.0, 0.1, 1.0), (1.0, 0.2, 2.0), 99.0, 0.1)
+    assert done.weights == schedule(99, 100) == (1.0, 0.15000000000000002, 1.5)
     assert (done.collocation_jitter, done.collocation_replay_share) == (pytest.approx(0.04), 0.9)
     summary = {"updates": 60, "collapsed_at": 60, "rolled_back_to": 30, **QUIET}
     write_json(task.folder / "summary.json", summary)
     back = read_result(task)
     assert (back.status, back.checkpoint, back.updates) == ("collapsed", "001/a", 30)
-    assert back.weights == task.schedule(29)
+    assert back.weights == task.schedule(29, 100)
     write_json(task.folder / "summary.json", {**summary, "rolled_back_to": 0})
-    assert (read_result(task).updates, read_result(task).weights, read_result(task).collocation_jitter) == (
-        0,
-        BASE.weights,
-        0.03,
-    )
+    back = read_result(task)
+    assert (back.updates, back.weights, back.collocation_jitter) == (0, BASE.weights, 0.03)
     write_json(task.folder / "summary.json", {"updates": 100, **QUIET, "reward": float("nan")})
     assert (read_result(task).status, read_result(task).checkpoint) == ("failed", None)
     assert "reward: expected a finite number, got nan" in read_result(task).reason
@@ -119,11 +113,9 @@ def test_who_is_stopped_has_not_failed(code, tmp_path):
 
 
 def test_weights_of_the_start_are_those_of_its_last_update(tmp_path):
-    schedule = (
-        "{updates: 5, schedule: {_target_: pirl_rl.schedules.LinearSchedule, initial: [1, 0, 1], final: [1, 1, 3]"
-    )
+    schedule = "{share: 5, schedule: {_target_: pirl_rl.schedules.LinearSchedule, initial: [1, 0, 1], final: [1, 1, 3]"
     visited = "{_target_: pirl_rl.sampling.collocation.ReplayCollocation, jitter: [0.1, 0.2], replay_share: [1, 0.5]}"
-    stages = f"stages=[{{updates: 5}}, {schedule}, start: 0, end: 5}}, collocation: {visited}}}]"
+    stages = f"stages=[{{share: 5}}, {schedule}, start: 0, end: 5}}, collocation: {visited}}}]"
     trainer = small_trainer(tmp_path / "before", stages, "trainer.updates=10", "evaluation.final=[success,calibration]")
     trainer.train()
     collocation = "collocation._target_=pirl_rl.sampling.collocation.ReplayCollocation"
