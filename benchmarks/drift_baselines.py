@@ -1,15 +1,16 @@
-"""The paper's drifting networks and ours, measured alike.
+"""The paper's networks for the drifting problem and runs of this package, under the same evaluators.
 
     python benchmarks/drift_baselines.py --weights DIR RUN_DIR ... --out FOLDER
 
-DIR holds the paper's networks as .npz files. All are measured on the committed reference states and on the planes'
-31 x 31 grids at tau = T, under the same simulators and seeds. MSE and success are over all states, "band" over those
-with friction inside the band of the targets. The paper's networks come twice: as they are, and masked, with V = 0 where
-friction makes the target unreachable, as ours always are.
+DIR holds the paper's networks as .npz files. All models are evaluated on the package's reference states and on 31 x 31
+grids of the planes at tau = T, under the same simulators and seeds. MSE and success are over all states, "band" over
+those with friction inside the band of the targets. The paper's networks have two rows: unchanged, and masked with V = 0
+where friction puts the target out of reach, as V of our runs always is.
 
-The last row is what outcomes alone allow: a plain network fitted to single Monte Carlo outcomes (fine simulator) of the
-first run's policy, from states of the same protocol, friction inside the band, and from the planes, with fresh seeds.
-FOLDER gets `baselines.md`, `baselines.json` with all numbers, and the figures of every model.
+The last row shows the accuracy that simulated outcomes alone allow. It is a network fitted to single Monte Carlo
+outcomes of the first run's policy under the fine simulator, from states of the same protocol with friction inside the
+band and from the planes, with other seeds. FOLDER gets `baselines.md`, `baselines.json` with all metrics, and the
+figures of every model.
 """
 
 from __future__ import annotations
@@ -56,8 +57,8 @@ COLUMNS = {
 SEED = 7
 
 
-class Solved:
-    """Stands for a `Solution` of the drifting problem; V is masked by what is known."""
+class DriftSolution:
+    """Has the interface of a `Solution` of the drifting problem; V is masked where the problem knows it."""
 
     dtype, device = torch.float32, torch.device("cpu")
 
@@ -75,8 +76,9 @@ class Solved:
         return self.raw_value(tau, x).masked_fill(self.problem.reached(x), 1.0).masked_fill(lost, 0.0)
 
 
-class Baseline(Solved):
-    """One of the paper's: actor 8-32-32-2, ReLU and tanh; two critics 10-64-64-64-1, tanh and sigmoid; V their mean."""
+class Baseline(DriftSolution):
+    """Networks of the paper: an actor 8-32-32-2 with ReLU and tanh, and two critics 10-64-64-64-1 with tanh and
+    sigmoid, whose mean is V."""
 
     def __init__(self, path: Path):
         super().__init__()
@@ -94,8 +96,15 @@ class Baseline(Solved):
         return torch.stack([critic(inputs).squeeze(-1) for critic in self.critics]).mean(0)
 
 
-class Regression(Solved):
-    """V of a given policy by regression of outcomes: 3 x 128 tanh, binary cross-entropy, Adam with cosine decay."""
+class Regression(DriftSolution):
+    """V of a given policy by regression of simulated outcomes: three layers of 128 tanh units, binary cross-entropy,
+    Adam with cosine decay.
+
+    Args:
+        policy: the policy.
+        updates: number of updates.
+        rollouts: number of simulated outcomes.
+    """
 
     def __init__(self, policy: Policy, updates: int, rollouts: int):
         super().__init__()
@@ -126,7 +135,8 @@ class Regression(Solved):
 
 
 def outcomes(problem: VehicleDrift, policy: Policy, count: int) -> tuple[Tensor, Tensor]:
-    """Network inputs (N, 8) and single payoffs (N,) of about `count` paths, a tenth from each plane at tau = T."""
+    """Network inputs (N, 8) and payoffs (N,) of single paths from about `count` states of the reference protocol, and
+    from a tenth of this number on each plane at tau = T."""
     rng = torch.Generator().manual_seed(SEED)
     visited = visited_by(Simulator(problem, **SIMULATORS["paper"]), policy, EquilibriumStates(), 8_192, rng)
     states = [displaced(problem, *visited, NETWORK_BOX, rng, count, 0.40)]
@@ -141,7 +151,7 @@ def outcomes(problem: VehicleDrift, policy: Policy, count: int) -> tuple[Tensor,
 
 
 def network_inputs(tau: Tensor, x: Tensor) -> Tensor:
-    """(N, 8) in [-1, 1], tau first."""
+    """tau and x scaled to [-1, 1], (N, 8)."""
     return NETWORK_BOX.normalize(torch.cat([tau.unsqueeze(-1), x], -1))
 
 
@@ -155,7 +165,7 @@ def _stack(weights: Mapping[str, Tensor], prefix: str, activation: nn.Module, ou
 
 
 def unmasked(accuracy: Evidence) -> AccuracyEvidence:
-    """The same evidence with the networks' own V in place of the masked one."""
+    """The same evidence with V of the networks alone, without the masks."""
     assert isinstance(accuracy, AccuracyEvidence)
     raw = {name: dataclasses.replace(one, value=one.raw_value) for name, one in accuracy.comparisons.items()}
     return dataclasses.replace(accuracy, comparisons=raw)
@@ -174,10 +184,10 @@ def main() -> None:
     parser.add_argument("runs", type=Path, nargs="*", metavar="RUN_DIR")
     parser.add_argument("--weights", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--rollouts", type=int, default=256, help="of each reference state")
-    parser.add_argument("--slice-rollouts", type=int, default=64, help="of each point of the planes' grids")
-    parser.add_argument("--fit-updates", type=int, default=10_000)
-    parser.add_argument("--fit-rollouts", type=int, default=1_000_000)
+    parser.add_argument("--rollouts", type=int, default=256, help="paths from each reference state")
+    parser.add_argument("--slice-rollouts", type=int, default=64, help="paths from each point of the planes' grids")
+    parser.add_argument("--fit-updates", type=int, default=10_000, help="updates of the regression")
+    parser.add_argument("--fit-rollouts", type=int, default=1_000_000, help="simulated outcomes for the regression")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     results: dict[str, dict[str, float]] = {}

@@ -1,15 +1,15 @@
-"""The committed reference states of the drifting problem, `pirl_rl/problems/drift/reference_states.npz`.
+"""Makes the reference states of the drifting problem, `pirl_rl/problems/drift/reference_states.npz`.
 
     python benchmarks/drift_states.py WEIGHTS/refnet_td3rand_10M.npz [--out FILE]
 
-The recipe, `pirl_rl.problems.drift.reference_states`, is the paper's protocol for its table of accuracy with a seed of
-our own. 1,024 episodes of the paper's TD3 policy of random horizon, without policy noise, start from the paper's full-
-scale law (friction uniform in [0.5, 0.6]; 30% displaced in the beta-r plane, 30% in the e_y-e_psi plane, 40% in both)
-with 1 to 50 steps to go, and are played by the paper's simulator (Euler steps of 0.1 s, exits at end points). Of the
-states before each step 512 are moved in a random direction of the paper's network coordinates (tau and all seven
-states scaled to [-1, 1]) by a length uniform in [0, 0.40] and clipped; those in the closed target or avoid set, or
-with tau = 0, are dropped. Distance is the mean to the ten nearest visited states, and makes five groups of equal
-size.
+The recipe in `pirl_rl.problems.drift.reference_states` is the paper's protocol for its table of accuracy, with another
+seed. The paper's TD3 policy for a random horizon plays 1,024 episodes without exploration noise. They start from the
+paper's distribution of full scale (friction uniform in [0.5, 0.6]; 30% displaced in the beta-r plane, 30% in the
+e_y-e_psi plane, 40% in both) with 1 to 50 steps to go, in the paper's simulator (Euler steps of 0.1 s, exits at end
+points). Of the states before each step, 512 are moved in a random direction of the paper's network coordinates (tau and
+all seven states scaled to [-1, 1]) by a length uniform in [0, 0.40] and clipped. States in the closed target or avoid
+set, or with tau = 0, are dropped. Five groups of equal size follow from the mean distance to the ten nearest visited
+states.
 """
 
 from __future__ import annotations

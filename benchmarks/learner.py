@@ -1,12 +1,13 @@
-"""Time of whole learner updates on one thread: the Ito fast path, compiled and eager, against nested autograd.
+"""Time of complete updates on one thread: Ito propagation, compiled and eager, against nested autograd.
 
     python benchmarks/learner.py [--rounds 60] [--updates 4]
 
-An update is TD, HJB and boundary terms, backward, fused Adam, and every second time the actor with its Adam and the
-soft update of the targets. All contenders share networks, points, optimisers and this loop. "nested" differentiates
-the same critics by one gradient with create_graph and one Hessian-vector product per noise channel, both critics at
-once; it cannot be compiled, so its other terms run eagerly, or compiled in "nested, rest compiled". "HJB term" is that
-loss alone, forward and backward. Contenders take turns, a few updates each; figures are medians over all turns.
+An update computes the TD, HJB and boundary losses with their gradients, makes a step of fused Adam, and every second
+time updates the actor and the target networks. All variants have equal networks, points and optimisers, and the same loop.
+"nested autograd" differentiates both critics at once by one gradient with create_graph and one Hessian-vector product
+per noise channel. These derivatives cannot be compiled; the other terms run eagerly too, or compiled in "nested, others
+compiled". "HJB term" is this loss alone, forward and backward. The variants take turns of a few updates each, and times
+are medians over all turns.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ class SevenStates(ReachAvoidProblem):
 
 
 class NestedLoss(PIRLLoss):
-    """The same loss with the generator by nested autograd."""
+    """`PIRLLoss` with the generator, Eq. (parabolic_operator), by nested autograd."""
 
     def _residuals(self, tau: Tensor, x: Tensor, action: Tensor, u: Tensor) -> Tensor:
         f, sigma = self.problem.drift(x, u), self.problem.diffusion(x, u)
@@ -97,8 +98,8 @@ def make_batch(shape: Shape) -> TensorDict:
     return TensorDict({"replay": replay, "collocation": collocation, "boundary": boundary})
 
 
-class Learner:
-    """One contender: `update()` is a whole update, `hjb()` the HJB term alone, forward and backward."""
+class Variant:
+    """A variant of the update: `update()` makes a complete update, `hjb()` computes the HJB loss and its gradient."""
 
     def __init__(self, shape: Shape, kind: type[PIRLLoss], compiled: bool):
         torch.manual_seed(0)
@@ -161,13 +162,13 @@ def milliseconds(work: Callable[[], None], repeats: int) -> float:
 
 
 def measure(shape: Shape, rounds: int, updates: int) -> None:
-    contenders = {
-        "nested autograd": Learner(shape, NestedLoss, compiled=False),
-        "nested, rest compiled": Learner(shape, NestedLoss, compiled=True),
-        "ours, eager": Learner(shape, PIRLLoss, compiled=False),
-        "ours, compiled": Learner(shape, PIRLLoss, compiled=True),
+    variants = {
+        "nested autograd": Variant(shape, NestedLoss, compiled=False),
+        "nested, others compiled": Variant(shape, NestedLoss, compiled=True),
+        "ours, eager": Variant(shape, PIRLLoss, compiled=False),
+        "ours, compiled": Variant(shape, PIRLLoss, compiled=True),
     }
-    works = {(name, part): getattr(learner, part) for name, learner in contenders.items() for part in ("update", "hjb")}
+    works = {(name, part): getattr(variant, part) for name, variant in variants.items() for part in ("update", "hjb")}
     for work in works.values():
         milliseconds(work, 6)
     times: dict[tuple[str, str], list[float]] = {key: [] for key in works}
@@ -175,7 +176,7 @@ def measure(shape: Shape, rounds: int, updates: int) -> None:
         for key, work in works.items():
             times[key].append(milliseconds(work, updates))
     median = {key: statistics.median(entries) for key, entries in times.items()}
-    for name in contenders:
+    for name in variants:
         row = [median[name, part] for part in ("update", "hjb")]
         gain = [median["nested autograd", part] / median[name, part] for part in ("update", "hjb")]
         print(f"| {shape.name} | {name} | {row[0]:.2f} | {gain[0]:.2f} | {row[1]:.2f} | {gain[1]:.2f} |")
@@ -188,7 +189,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     print(f"torch {torch.__version__}, 1 thread, medians of {arguments.rounds} x {arguments.updates} updates\n")
-    print("| shape | contender | update, ms | times faster | HJB term, ms | times faster |")
+    print("| shape | variant | update, ms | times faster | HJB term, ms | times faster |")
     print("|---|---|--:|--:|--:|--:|")
     for shape in SHAPES:
         measure(shape, arguments.rounds, arguments.updates)

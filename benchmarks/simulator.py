@@ -1,12 +1,12 @@
-"""Transitions a second on one thread: `env.step`, the same through TorchRL's collector, and the vehicle's steps.
+"""Transitions per second on one thread, of `env.step` and of TorchRL's collector, and vehicle steps per second.
 
     python benchmarks/simulator.py [--rounds 20]
 
-Reach1D under u = 1, Brownian bridge, dt = 0.1, physics included; steps start from freshly drawn states, which costs
-`env.step` nothing. The collector resets ended episodes itself. Figures are medians over the rounds.
+Reach1D runs under u = 1 with the Brownian bridge and dt = 0.1. Each `env.step` starts from the same states, which a
+reset has drawn before; the time of the collector includes the resets of ended episodes. Rates are medians over rounds.
 
-DriftEnv at batch 8,192 under delta' = 0 and F_x = 3 kN, dt = 0.1 and the bridge as above: vehicle steps a second with
-one sub-step, sub-steps a second with ten.
+DriftEnv runs at batch 8,192 under delta' = 0 and F_x = 3 kN, with the bridge and dt = 0.1. Its rates are vehicle steps
+per second with one integration step in each, and integration steps per second with ten.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from pirl_rl.problems.drift.env import DriftEnv
 from pirl_rl.problems.reach1d_env import Reach1DEnv
 
 
-def push(tau: torch.Tensor) -> torch.Tensor:
-    """u = 1."""
+def constant_policy(tau: torch.Tensor) -> torch.Tensor:
+    """The control u = 1."""
     return torch.ones_like(tau)
 
 
@@ -38,22 +38,22 @@ def step_rate(env: ReachAvoidEnv, steps: int, action: float = 1.0) -> float:
     start = env.reset()
     start["action"] = torch.full(env.action_spec.shape, action)
     env.step(start)
-    begin = time.perf_counter()
+    started = time.perf_counter()
     for _ in range(steps):
         env.step(start)
-    return steps * env.batch_size.numel() / (time.perf_counter() - begin)
+    return steps * env.batch_size.numel() / (time.perf_counter() - started)
 
 
 def collector_rates(env: Reach1DEnv, frames: int, rounds: int) -> list[float]:
-    policy = TensorDictModule(push, in_keys=["tau"], out_keys=["action"])
+    policy = TensorDictModule(constant_policy, in_keys=["tau"], out_keys=["action"])
     collector = Collector(env, policy, frames_per_batch=frames, total_frames=-1, postproc=flatten, track_traj_ids=False)
     rates, iterator = [], iter(collector)
     for _ in range(3):
         next(iterator)
     for _ in range(rounds):
-        begin = time.perf_counter()
+        started = time.perf_counter()
         next(iterator)
-        rates.append(frames / (time.perf_counter() - begin))
+        rates.append(frames / (time.perf_counter() - started))
     collector.shutdown()
     return rates
 
@@ -73,7 +73,7 @@ def main() -> None:
         print(f"| {batch:,} | {stepped:.2f} | {collected:.2f} |")
     print("\n| DriftEnv at batch 8,192, one thread | million/s |")
     print("|:--|--:|")
-    for substeps, unit in ((1, "one sub-step: vehicle steps"), (10, "ten sub-steps: sub-steps")):
+    for substeps, unit in ((1, "vehicle steps, one integration step each"), (10, "integration steps, ten a step")):
         env = DriftEnv(substeps=substeps, num_envs=8_192, seed=0)
         rate = statistics.median(step_rate(env, 20 // substeps, action=0.0) for _ in range(rounds))
         print(f"| {unit} | {substeps * rate / 1e6:.2f} |")

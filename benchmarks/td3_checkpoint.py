@@ -1,9 +1,9 @@
-"""The paper's TD3 networks as a run to start from.
+"""Converts the paper's TD3 networks to a run directory.
 
     python benchmarks/td3_checkpoint.py WEIGHTS.npz FOLDER
 
-FOLDER becomes a run directory of `drift_td3_random` that holds weights alone: `load_run` opens it, `train start=FOLDER`
-and `tune start=FOLDER` go on from it.
+FOLDER becomes a run directory of `drift_td3_random` with the networks alone. `load_run` opens it, and `train` and
+`tune` can start from it with start=FOLDER.
 """
 
 from __future__ import annotations
@@ -13,12 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from hydra import compose, initialize_config_dir
 
 from pirl_rl import checkpoint
-from pirl_rl.assembly import make_loss
-from pirl_rl.configuration import CONF, save_config
-from pirl_rl.problems import VehicleDrift
+from pirl_rl.assembly import make_trainer
+from pirl_rl.commands.composition import compose
+from pirl_rl.configuration import save_config
 from pirl_rl.run_directory import RunDirectory
 
 
@@ -28,17 +27,16 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     arguments = parser.parse_args()
     if arguments.folder.exists():
-        parser.error(f"{arguments.folder} exists")
+        parser.error(f"folder: expected a new folder, but {arguments.folder} exists")
     with np.load(arguments.weights, allow_pickle=False) as file:
         weights = {name: torch.from_numpy(file[name]) for name in file.files if name.endswith(("weight", "bias"))}
         update = int(file["itr"])
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("train", ["+experiment=drift_td3_random", "device=cpu"])
-    loss = make_loss(config, VehicleDrift())
+    config = compose("train", ["+experiment=drift_td3_random", "device=cpu"])
+    loss = make_trainer(config).learner.loss
     state = loss.state_dict()
     ours = "{}_network_params.module.layers.{}.{}"
     for kind in ("weight", "bias"):
-        for layer in (0, 2, 4):  # ours begin with the scaling of the inputs
+        for layer in (0, 2, 4):  # our first layer scales the inputs
             state[ours.format("actor", layer + 1, kind)] = weights[f"actor.net.{layer}.{kind}"]
         for layer in (0, 2, 4, 6):
             twins = [weights[f"critic.{twin}_net.net.{layer}.{kind}"] for twin in ("q1", "q2")]

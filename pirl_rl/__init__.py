@@ -1,6 +1,6 @@
 """Stochastic reach-avoid analysis of controlled systems by physics-informed reinforcement learning.
 
-Names are imported on first use, so that `import pirl_rl` itself loads nothing, torch included.
+Names are imported on first use, so that `import pirl_rl` itself loads neither torch nor any other library.
 """
 
 from importlib import import_module
@@ -40,7 +40,7 @@ __all__ = [
     "union",
 ]
 
-_HOMES = {
+_MODULE_OF = {
     **dict.fromkeys(("check", "load_run", "monte_carlo"), "pirl_rl.api"),
     **dict.fromkeys(("Box", "Plane", "band", "complement", "difference", "intersection", "union"), "pirl_rl.sets"),
     "PIRLLoss": "pirl_rl.losses",
@@ -52,12 +52,12 @@ _HOMES = {
 """The module of each name."""
 
 _MODULES = ("problems", "train", "evaluate")
-"""Names of modules; the latter two are commands, and the functions of the same name when they are called."""
+"""Modules of the package. Those of the commands `train` and `evaluate` can also be called, like the functions."""
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOMES:
-        value = getattr(import_module(_HOMES[name]), name)
+    if name in _MODULE_OF:
+        value = getattr(import_module(_MODULE_OF[name]), name)
     elif name in _MODULES:
         value = import_module(f"{__name__}.{name}")
     else:

@@ -1,4 +1,4 @@
-"""`python -m pirl_rl`: see `pirl_rl.commands.catalogue`."""
+"""`python -m pirl_rl`, see `pirl_rl.commands.catalogue`."""
 
 from pirl_rl.commands.catalogue import catalogue
 

@@ -1,4 +1,4 @@
-"""The road from Python: train, open, evaluate and check, as `pirl_rl.train(...)` and so on."""
+"""The Python interface, which `pirl_rl` exports: train, open a run, evaluate, check a problem, and Monte Carlo."""
 
 from __future__ import annotations
 
@@ -32,32 +32,32 @@ def train(
     folder: str | PathLike[str] | None = None,
     **settings: Any,
 ) -> Run:
-    """Train, exactly as `python -m pirl_rl.train` does, into a new run directory.
+    """Train like `python -m pirl_rl.train`, in a new run directory.
 
         run = pirl_rl.train("reach1d", updates=2_000, seed=3)
         run = pirl_rl.train(MyProblem, method="pirl", **{"schedule.center": 1e3})
 
     Args:
         problem_or_experiment: the name of an experiment, or a problem of your own, a class or an object, which is
-            trained with the settings of the experiment `own`. A class that can be imported is named by the run's
-            configuration. Any other problem, an object or a notebook's class, is not, and such a run opens with
+            trained with the settings of the experiment `own`. The configuration of the run names a class that can be
+            imported. It cannot name an object or a class of a notebook, so that such a run is opened with
             `load_run(folder, problem=...)`.
-        folder: the run directory, new or empty; default `runs/<experiment>/<time>-<seed>`.
+        folder: the run directory, new or empty; the default is `runs/<experiment>/<time>-<seed>`.
         **settings: an argument of the trainer (`updates=200`), a key of the configuration (`seed=3`, `compile=False`),
             a choice of a group (`method="td3"`, `logger="none"`), a nested mapping (`schedule={"center": 1e3}`) or a
-            name with dots (`**{"schedule.center": 1e3}`).
+            key with dots (`**{"schedule.center": 1e3}`).
 
     Returns:
         The run, opened from its directory.
 
     Raises:
-        ConfigError: an unknown setting, with those that are known, or a value that cannot be built.
-        ProblemError: a problem that contradicts itself.
-        DivergenceError: a loss became infinite or exploded.
-        Interrupted: training was asked to stop; it can go on from the run directory.
+        ConfigError: for an unknown setting, or a value that cannot be built; the message lists the known settings.
+        ProblemError: if the problem contradicts itself.
+        DivergenceError: if a loss is not finite or explodes.
+        Interrupted: if training was asked to stop; it can be resumed from the run directory.
     """
     if "resume" in settings:
-        raise ConfigError("resume: a run goes on with python -m pirl_rl.train resume=RUN_DIR, expected a new one here")
+        raise ConfigError("resume: expected settings of a new run; resume with python -m pirl_rl.train resume=RUN_DIR")
     experiment, problem, named, trust = _subject(problem_or_experiment)
     config, typed = compose_run(experiment, {**named, **settings})
     default = run_folder(config)
@@ -69,28 +69,29 @@ def train(
 
 
 def _subject(subject: Any) -> tuple[str, ReachAvoidProblem | None, dict[str, str], list[str]]:
-    """The experiment, the problem where no configuration can name it, else the settings that do, and what they trust.
+    """The experiment, the problem if no configuration can name it, the settings that name it else, and their modules.
 
     Raises:
-        ArgumentError: neither a name nor a problem.
+        ArgumentError: if the argument of `train` is neither a name nor a problem.
     """
     if isinstance(subject, str):
         return subject, None, {}, []
     if inspect.isclass(subject) and issubclass(subject, ReachAvoidProblem):
         if missing := ", ".join(sorted(subject.__abstractmethods__)):
-            raise ArgumentError(f"{subject.__qualname__} lacks {missing}")
+            raise ArgumentError(f"problem_or_experiment: {subject.__qualname__} lacks {missing}")
         if not _importable(subject):
             return "own", subject(), {}, []
         return "own", None, {"env.problem._target_": f"{subject.__module__}.{subject.__name__}"}, [subject.__module__]
     if isinstance(subject, ReachAvoidProblem):
         return "own", subject, {}, []
     raise ArgumentError(
-        f"expected the name of an experiment, a ReachAvoidProblem or a class of these, got {type(subject).__name__}"
+        "problem_or_experiment: expected the name of an experiment, a ReachAvoidProblem or a subclass of it, got "
+        f"{type(subject).__name__}"
     )
 
 
 def _importable(subject: type) -> bool:
-    """Whether another process finds the class under its name; `__main__` is another module there."""
+    """Whether another process can import the class by its name; in another process `__main__` is another module."""
     if subject.__module__ == "__main__":
         return False
     try:
@@ -100,12 +101,12 @@ def _importable(subject: type) -> bool:
 
 
 def evaluate(run: Run | str | PathLike[str], *, trust: Sequence[str] = (), **settings: Any) -> dict[str, float]:
-    """Call a run's final evaluators again, with other samples if asked; nothing is written.
+    """Call the final evaluators of a run, with changed settings if wanted. Nothing is written.
 
         pirl_rl.evaluate(run, final=["success"], success={"episodes": 100_000})
 
     Args:
-        run: an open run, or its directory.
+        run: a run, or its directory.
         trust: modules outside pirl_rl that its configuration may name.
         **settings: entries of `evaluation`, or any key of the run's configuration, as in `train`.
 
@@ -113,7 +114,7 @@ def evaluate(run: Run | str | PathLike[str], *, trust: Sequence[str] = (), **set
         The metrics by name.
 
     Raises:
-        ConfigError: an unknown setting, with those that are known, or a value that cannot be built.
+        ConfigError: for an unknown setting, or a value that cannot be built; the message lists the known settings.
     """
     if not isinstance(run, Run):
         run = load_run(Path(run), trust)

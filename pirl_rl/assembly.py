@@ -1,4 +1,4 @@
-"""From a configuration to a trainer, and back to where a checkpoint left it."""
+"""Assembly of a trainer and its parts from a configuration, and their restoration from a checkpoint."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ from pirl_rl.trainer import Trainer
 
 
 def pick_device(name: str) -> torch.device:
-    """ "auto" is CUDA where there is one.
+    """The device of a name; "auto" is CUDA if it is available, else the CPU.
 
     Raises:
-        ConfigError: an unknown name, or CUDA where there is none.
+        ConfigError: for an unknown name, or "cuda" without a CUDA device.
     """
     if name not in ("auto", "cpu", "cuda"):
         raise ConfigError(f"device: expected auto, cpu or cuda, got {name!r}")
     if name == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("device: expected a CUDA device for device=cuda, found none; use device=cpu or auto")
+        raise ConfigError("device: expected a CUDA device for device=cuda, got none; use device=cpu or auto")
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
 def make_networks(
     config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[str] = ()
 ) -> tuple[Actor, list[Critic]]:
-    """Fresh networks on the configuration's device: the actor and the critics."""
+    """New networks, the actor and the critics, on the configuration's device."""
     device = pick_device(config.device)
     actor = build(config.actor, "actor", trust, problem=problem).to(device)
     count = convert(config.critics, Literal[1, 2], "critics")
@@ -51,7 +51,7 @@ def make_networks(
 
 
 def make_simulator(config: DictConfig, problem: ReachAvoidProblem) -> Simulator:
-    """The simulator that the training environment plays."""
+    """The simulator of the training environment."""
     steps = {name: config.env[name] for name in ("dt", "substeps", "crossing") if name in config.env}
     return Simulator(problem, **steps)
 
@@ -60,7 +60,7 @@ def make_problem(config: DictConfig, trust: Sequence[str] = ()) -> ReachAvoidPro
     """The problem that a configuration names.
 
     Raises:
-        ConfigError: it names none, as that of a run on an object that only Python code has.
+        ConfigError: if it names none, for example because the run was trained on an object of Python code.
     """
     node = config.env.problem
     if isinstance(node, DictConfig) and OmegaConf.is_missing(node, "_target_"):
@@ -74,16 +74,16 @@ def make_problem(config: DictConfig, trust: Sequence[str] = ()) -> ReachAvoidPro
 def make_trainer(
     config: DictConfig, folder: Path | None = None, trust: Sequence[str] = (), problem: ReachAvoidProblem | None = None
 ) -> Trainer:
-    """Everything a configuration names, put together; nothing is written yet.
+    """Build the trainer of a configuration with all its parts; nothing is written yet.
 
     Args:
-        config: all settings.
+        config: the configuration of a run.
         folder: the run directory; None keeps everything in memory.
         trust: modules outside the package that the configuration may name.
-        problem: what is trained on in place of `env.problem`.
+        problem: replaces `env.problem`.
 
     Raises:
-        ConfigError: naming the key, what was expected and what was got.
+        ConfigError: with the key, what was expected and what was got.
     """
     device = pick_device(config.device)
     seed = convert(config.seed, int, "seed")
@@ -97,9 +97,9 @@ def make_trainer(
     parts = {"problem": problem, "simulator": env.simulator}
     actor, critics = make_networks(config, problem, trust)
     with warnings.catch_warnings():
-        # The learner makes the updater of the target networks after the loss.
+        # TorchRL warns that the loss has no updater of the target networks, which the learner creates later.
         warnings.filterwarnings("ignore", message="No target network updater")
-        # The networks are on their device already: moving the loss alone would leave it buffers of its own.
+        # The networks were moved to their device before, so that the loss shares their buffers.
         loss = build(config.loss, "loss", trust, parts, problem=problem, actor=actor, critics=critics).to(device)
     return build(
         config.trainer,
@@ -122,7 +122,7 @@ def make_trainer(
 
 
 def _without_problem(config: DictConfig) -> DictConfig:
-    """The environment's settings beside the problem, in a copy of all settings, to which they may refer."""
+    """The settings of the environment without the problem, in a copy of the configuration, to whose keys they refer."""
     others = copy.deepcopy(config)
     with open_dict(others):
         others.env.pop("problem", None)
@@ -135,12 +135,21 @@ def _make_stage(node: DictConfig, key: str, trust: Sequence[str], parts: Mapping
 
 
 def make_evaluation_simulator(config: DictConfig, problem: ReachAvoidProblem) -> Simulator:
-    """The simulator that plays the paths of the evaluators."""
+    """The simulator of the evaluators."""
     return build(config.evaluation.simulator, "evaluation.simulator", problem=problem)
 
 
 def make_evaluators(config: DictConfig, when: str, trust: Sequence[str]) -> dict[str, Evaluator]:
-    """The evaluators of the list `when`, "during" or "final", of the node `evaluation`, by name."""
+    """The evaluators of one of the lists "during" and "final" of the node `evaluation`, by name.
+
+    Args:
+        config: the node `evaluation`.
+        when: name of the list.
+        trust: modules outside the package that the node may name.
+
+    Raises:
+        ConfigError: if an entry of the list is not the name of an evaluator, or an evaluator cannot be built.
+    """
     names = config[when]
     nodes = [str(name) for name in config if isinstance(config[name], DictConfig)]
     known = [name for name in nodes if name != "simulator"]
@@ -150,11 +159,11 @@ def make_evaluators(config: DictConfig, when: str, trust: Sequence[str]) -> dict
 
 
 def restore(trainer: Trainer) -> None:
-    """Put a trainer where its run directory's last checkpoint left it.
+    """Restore the state of a trainer from the last checkpoint of its run directory.
 
     Raises:
-        CheckpointError: none there, a broken one, or one of another configuration.
-        ConfigError: the run is further than `trainer.updates` already.
+        CheckpointError: if the checkpoint is missing, broken or of another configuration.
+        ConfigError: if the run has already made more than `trainer.updates` updates.
     """
     assert trainer.folder is not None
     path = RunDirectory(trainer.folder).last
@@ -162,28 +171,30 @@ def restore(trainer: Trainer) -> None:
     with fitting(path):
         expected = trainer.state_dict()
         if state.get("rollback") is None:
-            del expected["rollback"]  # the guard may watch from here on
+            del expected["rollback"]  # a resumed run may switch the guard on
         _check_learner(state, expected.pop("learner"))
         check_entries(state, expected)
     trainer.load_state_dict(state)
     if trainer.update > trainer.updates:
-        raise ConfigError(f"trainer.updates: {trainer.folder} has done {trainer.update} already, got {trainer.updates}")
+        message = f"expected at least {trainer.update}, which {trainer.folder} has made, got {trainer.updates}"
+        raise ConfigError(f"trainer.updates: {message}")
 
 
 def start_from(trainer: Trainer, start: str) -> Path:
-    """Give a new trainer the networks and targets of another run, and from a `last.pt` its optimisers and transitions.
+    """Load the networks and target networks of another run into a new trainer.
 
-    The transitions of a run that collapsed are those of spoilt networks: they stay behind.
+    A `last.pt` also gives the optimisers and the transitions of the replay buffer, except after a collapse: those
+    transitions were played by the collapsed policy.
 
     Args:
-        trainer: fresh; keeps its own seeds and counts its own updates.
-        start: a run directory, of which the newest checkpoint is taken, or a file of its `checkpoints/`.
+        trainer: the new trainer, which keeps its seeds and counts its updates from 0.
+        start: a run directory, whose newest checkpoint is taken, or a file in its `checkpoints/`.
 
     Returns:
-        The checkpoint's file, absolute.
+        The absolute path of the checkpoint.
 
     Raises:
-        CheckpointError: none there, a broken one, or one of another configuration.
+        CheckpointError: if the checkpoint is missing, broken or of another configuration.
     """
     path = RunDirectory(start).newest() if Path(start).is_dir() else Path(start)
     state = checkpoint.load(path)
@@ -206,14 +217,18 @@ def start_from(trainer: Trainer, start: str) -> Path:
 
 
 def _check_learner(state: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
-    rest = {name: entry for name, entry in expected.items() if name != "loss"}
-    check_entries(state, {"learner": rest})
+    others = {name: entry for name, entry in expected.items() if name != "loss"}
+    check_entries(state, {"learner": others})
     check_module(state["learner"]["loss"], expected["loss"])
 
 
 @contextmanager
 def fitting(path: Path) -> Iterator[None]:
-    """An argument that is refused while a checkpoint is checked and loaded becomes an error that names the file."""
+    """Turn the refusal of an argument, while a checkpoint is checked or loaded, into an error that names the file.
+
+    Raises:
+        CheckpointError: if the block raises an ArgumentError.
+    """
     try:
         yield
     except ArgumentError as error:

@@ -1,4 +1,4 @@
-"""`python -m pirl_rl.compare`: see `pirl_rl.runs.compare`."""
+"""`python -m pirl_rl.compare`, see `pirl_rl.runs.compare`."""
 
 from pirl_rl.runs.compare import main
 

@@ -1,8 +1,8 @@
-"""From configuration nodes to objects: a node with `_target_` names a class of ours and its constructor arguments.
+"""Objects from configuration nodes: a node with a `_target_` names a class and its constructor arguments.
 
-Unlike a bare `hydra.utils.instantiate`, a node can only build the classes of this package, or what modules that the
-user names define: a run directory from elsewhere runs no code. Keys and types are checked against the constructor's
-signature first, so that a mistyped key fails at start with its name.
+Unlike `hydra.utils.instantiate`, a node can only build classes of this package or objects of modules that the user
+trusts, so that a foreign run directory runs no code. Keys and types are checked against the signature of the
+constructor first, so that a mistyped key is refused by its name.
 """
 
 from __future__ import annotations
@@ -28,25 +28,28 @@ from pirl_rl.run_directory import FORMAT, RunDirectory
 
 PACKAGE = Path(__file__).resolve().parent
 CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"
-"""Where the configuration lies: inside an installed package, or beside it in a checkout."""
+"""The folder of the configuration, inside an installed package or beside it in a checkout."""
 
 REFERENCE = re.compile(r"\$\{[\w.]+\}")
+"""A reference to another key of the configuration."""
+
 CHECKED = (bool, int, float, str, type(None))
+"""Types of values that are checked against the constructor's annotation."""
 
 
 def build(node: Any, key: str, trust: Sequence[str] = (), parts: Mapping[str, Any] | None = None, **extra: Any) -> Any:
-    """Build the object that a node describes, nested nodes first.
+    """Build the object that a node describes, after the objects of nested nodes.
 
     Args:
-        node: an OmegaConf mapping with `_target_`.
-        key: the node's place in the configuration, for messages.
-        trust: modules outside the package that may be named.
-        parts: objects that this and all nested constructors get where they require an argument of that name.
+        node: an OmegaConf mapping with a `_target_`.
+        key: key of the node in the configuration, for messages.
+        trust: modules outside the package that the node may name.
+        parts: objects by the names of the arguments for which this and all nested constructors get them, if required.
         extra: constructor arguments of this object that no configuration can hold.
 
     Raises:
-        ConfigError: an unknown or forbidden target, an unknown key, a wrong type, or a constructor's refusal, which is
-            a `PirlError`. Any other error of a constructor is a bug, ours or the user's, and is left as it is.
+        ConfigError: for an unknown or forbidden target, an unknown key, a wrong type, or a `PirlError` of the
+            constructor, which refuses an argument. Any other error of a constructor is a bug and is left unchanged.
     """
     if not isinstance(node, DictConfig) or "_target_" not in node:
         raise ConfigError(f"{key}: expected settings with a _target_, got {node!r}")
@@ -64,9 +67,9 @@ def build(node: Any, key: str, trust: Sequence[str] = (), parts: Mapping[str, An
 
 
 def _value(node: DictConfig | ListConfig, name: Any, key: str, trust: Sequence[str], parts: Mapping[str, Any]) -> Any:
-    """An entry of a node: nodes with `_target_` built, lists and plain mappings as Python's."""
+    """An entry of a node: nodes with a `_target_` are built, lists and other mappings become Python objects."""
     if OmegaConf.is_missing(node, name):
-        raise ConfigError(f"{key}: a value is missing, give {key}=...")
+        raise ConfigError(f"{key}: a value is missing, expected {key}=...")
     value = node[name]
     if isinstance(value, ListConfig):
         return [_value(value, index, f"{key}[{index}]", trust, parts) for index in range(len(value))]
@@ -78,9 +81,17 @@ def _value(node: DictConfig | ListConfig, name: Any, key: str, trust: Sequence[s
 
 
 def resolve(target: str, key: str, trust: Sequence[str] = ()) -> Any:
-    """What a target names: a class defined in this package, or anything callable defined in a trusted module.
+    """The class of this package, or the callable of a trusted module, that a target names.
 
-    Constructors here only keep their arguments, functions may act: a configuration never calls those.
+    Functions of this package are refused: unlike its constructors, they may read and write files.
+
+    Args:
+        target: name of the object, such as "pirl_rl.sets.Box".
+        key: key of the target in the configuration, for messages.
+        trust: modules outside the package whose objects are allowed.
+
+    Raises:
+        ConfigError: if the target does not exist or is not allowed.
     """
     if not _within(target, ("pirl_rl", *trust)):
         raise ConfigError(
@@ -91,13 +102,14 @@ def resolve(target: str, key: str, trust: Sequence[str] = ()) -> Any:
     if not module:
         raise ConfigError(f"{key}: expected a class as module.Name, got {target}")
     try:
-        # Any other error while a module is imported is a bug in it.
+        # Another error during the import is a bug of the module and is left unchanged.
         found = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
         raise ConfigError(f"{key}: cannot load {target}: {type(error).__name__}: {error}") from error
-    # A module also holds what it imports: pirl_rl.checkpoint.Path is not ours.
-    home = getattr(found, "__module__", None) or ""
-    if not ((inspect.isclass(found) and _within(home, ("pirl_rl",))) or (callable(found) and _within(home, trust))):
+    # A module also has the names that it imports, such as pirl_rl.checkpoint.Path.
+    defined_in = getattr(found, "__module__", None) or ""
+    own = inspect.isclass(found) and _within(defined_in, ("pirl_rl",))
+    if not (own or (callable(found) and _within(defined_in, trust))):
         raise ConfigError(f"{key}: {target} is not a class defined in {' or '.join(('pirl_rl', *trust))}")
     return found
 
@@ -109,7 +121,11 @@ def _within(name: str, modules: Sequence[str]) -> bool:
 def _checked(
     constructor: Any, values: dict[str, Any], key: str, extra: Mapping[str, Any], parts: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The values with their types converted and with the parts they lack, or a ConfigError that names the key."""
+    """The values with converted types and with the parts that the constructor requires.
+
+    Raises:
+        ConfigError: for an unknown key, a missing value or a wrong type.
+    """
     parameters = parameters_of(constructor)
     open_ended = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
     hints = _hints(constructor)
@@ -127,13 +143,13 @@ def _checked(
         if not required or name in values or name in extra:
             continue
         if name not in parts:
-            raise ConfigError(f"{key}.{name}: a value is missing, {constructor.__qualname__} needs it")
+            raise ConfigError(f"{key}.{name}: a value is missing, {constructor.__qualname__} requires it")
         checked[name] = parts[name]
     return checked
 
 
 def parameters_of(constructor: Any) -> Mapping[str, inspect.Parameter]:
-    """The parameters of a class's own constructor, which a metaclass as TorchRL's may hide, or of a function."""
+    """The parameters of a function or of the `__init__` of a class, which a metaclass like TorchRL's may hide."""
     if not inspect.isclass(constructor) or constructor.__init__ is object.__init__:
         return inspect.signature(constructor).parameters
     _, *parameters = inspect.signature(constructor.__init__).parameters.items()
@@ -149,14 +165,18 @@ def _hints(constructor: Any) -> dict[str, Any]:
 
 
 def convert(value: Any, expected: Any, key: str) -> Any:
-    """A plain value as the type it should have; ConfigError where it is none."""
+    """Convert a plain value, or a list of them, to the expected type; other values are returned unchanged.
+
+    Raises:
+        ConfigError: if the value cannot be converted.
+    """
     plain = isinstance(value, CHECKED) or (isinstance(value, list) and all(isinstance(v, CHECKED) for v in value))
     if not plain:
         return value
     try:
         return pydantic.TypeAdapter(expected, config={"arbitrary_types_allowed": True}).validate_python(value)
     except (pydantic.PydanticSchemaGenerationError, pydantic_core.SchemaError):
-        return value  # a type that pydantic knows no check for, as a protocol
+        return value  # pydantic cannot check this type, for example a protocol
     except pydantic.ValidationError as error:
         name = getattr(expected, "__name__", None) if inspect.isclass(expected) else str(expected)
         reason = error.errors()[0]["msg"]
@@ -164,12 +184,14 @@ def convert(value: Any, expected: Any, key: str) -> Any:
 
 
 def load_config(folder: str | Path) -> DictConfig:
-    """The configuration of a run directory, in the present format.
+    """The configuration of a run directory, converted to the current format.
 
-    It may refer to its own keys, `${env.dt}`, but call no resolver: `${oc.env:TOKEN}` would read what is not its own.
+    It may refer to its own keys, as in `${env.dt}`, but call no resolver: `${oc.env:TOKEN}` would read a secret of the
+    user.
 
     Raises:
-        ConfigError: the folder is not a run directory, its configuration calls resolvers, or is of a later format.
+        ConfigError: if the folder is not a run directory, or its configuration cannot be read, calls a resolver or is
+            of a later format.
     """
     path = RunDirectory(folder).config
     if not path.is_file():
@@ -177,14 +199,16 @@ def load_config(folder: str | Path) -> DictConfig:
     try:
         config = OmegaConf.load(path)
         if not isinstance(config, DictConfig):
-            raise ConfigError(f"{path}: expected a mapping")
+            raise ConfigError(f"{path}: expected a mapping, got {type(config).__name__}")
         raw = OmegaConf.to_container(config, resolve=False)
         _refuse_resolvers(raw, str(path))
         written_in = config.pop("format", 1)
         if written_in == 1:
             config = _upgraded(config, raw)
         elif written_in != FORMAT:
-            raise ConfigError(f"{path}: expected format 1 to {FORMAT}, got {written_in}; a later version wrote it")
+            raise ConfigError(
+                f"{path}: expected format 1 to {FORMAT}, got {written_in}, which a later version of pirl_rl writes"
+            )
     except (yaml.YAMLError, UnicodeDecodeError, OmegaConfBaseException, OSError) as error:
         raise ConfigError(f"{path} is not readable: {str(error).partition(chr(10))[0]}") from None
     OmegaConf.set_struct(config, True)
@@ -192,7 +216,7 @@ def load_config(folder: str | Path) -> DictConfig:
 
 
 def _upgraded(config: DictConfig, raw: Any) -> DictConfig:
-    """A configuration of format 1 in the present one; where it referred to a key that stands yet, it still does."""
+    """Convert a configuration of format 1 to the current one; references between keys that both have are kept."""
     new = OmegaConf.create(upgraded(OmegaConf.to_container(config, resolve=True)))  # type: ignore[arg-type]
     for key, reference in _references(raw):
         values = [OmegaConf.select(new, name) for name in (key, reference[2:-1])]
@@ -202,7 +226,7 @@ def _upgraded(config: DictConfig, raw: Any) -> DictConfig:
 
 
 def _references(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
-    """All (key, "${other.key}") of nested mappings."""
+    """All pairs (key, "${other.key}") of nested mappings."""
     for name, inner in value.items():
         if isinstance(inner, dict):
             yield from _references(inner, f"{key}{name}.")
@@ -219,6 +243,6 @@ def _refuse_resolvers(value: Any, key: str) -> None:
 
 
 def save_config(config: DictConfig, folder: str | Path) -> None:
-    """Write what `load_config` reads."""
+    """Write the configuration of a run directory for `load_config`."""
     with replacing(RunDirectory(folder).config) as file:
         file.write(f"format: {FORMAT}\n{OmegaConf.to_yaml(config)}")

@@ -1,4 +1,4 @@
-"""`python -m pirl_rl.export`: see `pirl_rl.commands.export`."""
+"""`python -m pirl_rl.export`, see `pirl_rl.commands.export`."""
 
 from pirl_rl.commands.export import main
 

@@ -1,8 +1,8 @@
-"""Configurations of earlier formats in the present one's words: tables of what moved, and of what is said otherwise.
+"""Conversion of configurations of format 1 to the current format.
 
-Format 1 named the actor's rule by a word and kept its arguments in the loss, gave every evaluator a simulator of its
-own, and counted the schedule of a stage in a unit that the run then stretched. Here are plain nested dicts, with all
-references resolved.
+In format 1 the actor rule is a word with its arguments in the loss, every evaluator has its own simulator, and the
+schedule of a stage counts in units that stretch with the length of the run. The functions take and return nested dicts
+with all references resolved.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-Node = dict[str, Any]
+NestedDict = dict[str, Any]
 
 RULES = "pirl_rl.actor_rules"
 STATES = "pirl_rl.sampling.initial_states"
@@ -24,31 +24,31 @@ MOVED = {
     "pirl_rl.collocation.BoundarySampler": "pirl_rl.sampling.boundary.BoundarySampler",
     "pirl_rl.evaluation.DriftStates": f"{DRIFT}.reference_states.DriftStates",
 }
-"""`_target_` of format 1 -> present `_target_`."""
+"""The current `_target_` of each `_target_` of format 1 that has moved."""
 
 SIMULATOR = ("dt", "substeps", "crossing")
-"""Arguments of a simulator, which the environment has and each evaluator of format 1 had too."""
+"""Arguments of a simulator, which in format 1 the environment and each evaluator have."""
 
 RULE_DEFAULTS = {"actor_rule": "both", "model_steps": 1, "ppo_clip": 0.2}
-"""What the loss of format 1 took where its configuration was silent."""
+"""Defaults of the arguments of the loss of format 1 that define the actor rule."""
 
 LOSS_DROPPED = ("model_steps", "simulator", "exploration_noise", "ppo_clip")
-"""Arguments of the loss of format 1 that are the actor rule's."""
+"""Arguments of the loss of format 1 that are arguments of the actor rule in the current format."""
 
 UPDATE_COUNTS, PER_UPDATE = ("center", "start", "end"), ("steepness",)
 """Arguments of a schedule that are numbers of updates, and those that are numbers per update."""
 
 
-def upgraded(config: Mapping[str, Any]) -> Node:
-    """A configuration of format 1 as one of the present format.
+def upgraded(config: Mapping[str, Any]) -> NestedDict:
+    """Convert a configuration of format 1 to the current format.
 
     Args:
-        config: nested dicts and lists with all references resolved; it is left as it is.
+        config: nested dicts and lists with all references resolved; it is not changed.
 
     Returns:
-        A new dict. `pirl`, to which only references pointed, is left out.
+        A new dict. The block `pirl`, which holds values for references only, is left out.
     """
-    new: Node = {name: _moved(value) for name, value in config.items() if name != "pirl"}
+    new: NestedDict = {name: _moved(value) for name, value in config.items() if name != "pirl"}
     loss, collector = _dict(new.get("loss")), _dict(new.get("collector"))
     rule = {name: loss.get(name, default) for name, default in RULE_DEFAULTS.items()}
     rule["exploration_noise"] = collector.get("exploration_noise", 0.0)
@@ -63,13 +63,13 @@ def upgraded(config: Mapping[str, Any]) -> Node:
     return new
 
 
-def _dict(value: Any) -> Node:
-    """The settings of a node; none where something else stands in its place, which is refused where it is built."""
+def _dict(value: Any) -> NestedDict:
+    """A value if it is a dict, else an empty dict: another value in its place is refused when it is built."""
     return value if isinstance(value, dict) else {}
 
 
 def _moved(value: Any) -> Any:
-    """A copy with every `_target_` where it is found at present."""
+    """A copy with the current name of every `_target_`."""
     if isinstance(value, Mapping):
         copy = {name: _moved(entry) for name, entry in value.items()}
         if "_target_" in copy:
@@ -78,8 +78,8 @@ def _moved(value: Any) -> Any:
     return [_moved(entry) for entry in value] if isinstance(value, list) else value
 
 
-def _actor_rule(rule: Mapping[str, Any]) -> Node | Any:
-    """The node of a rule that format 1 named by a word; another value stays, to be refused where it is built."""
+def _actor_rule(rule: Mapping[str, Any]) -> NestedDict | Any:
+    """The node of a rule that format 1 names by a word; another value is kept, and refused when it is built."""
     q, hamiltonian = {"_target_": f"{RULES}.Q"}, {"_target_": f"{RULES}.Hamiltonian"}
     nodes = {
         "q": q,
@@ -95,8 +95,8 @@ def _actor_rule(rule: Mapping[str, Any]) -> Node | Any:
     return nodes.get(rule["actor_rule"], rule["actor_rule"])
 
 
-def _stage(stage: Node, run: Mapping[str, Any], stretch: float) -> Node:
-    """A stage whose length is a share, with its rule as a node and its schedule in updates of the run."""
+def _stage(stage: NestedDict, run: Mapping[str, Any], stretch: float) -> NestedDict:
+    """A stage with its length as a share, its rule as a node, and its schedule in updates of the run."""
     new = {"share" if name == "updates" else name: value for name, value in stage.items() if name != "model_steps"}
     own = {name: stage[name] for name in run if stage.get(name) is not None}
     rule = _actor_rule({**run, **own})
@@ -113,8 +113,8 @@ def _stretched(name: str, value: Any, stretch: float) -> Any:
     return value / stretch if name in PER_UPDATE else value
 
 
-def _evaluation(evaluation: Node, env: Mapping[str, Any]) -> Node:
-    """Evaluators without simulators, and the environment's for all of them, by reference."""
+def _evaluation(evaluation: NestedDict, env: Mapping[str, Any]) -> NestedDict:
+    """The evaluators without simulators, and one simulator for all of them with the settings of the environment."""
     new = {
         name: {key: entry for key, entry in value.items() if key not in SIMULATOR}
         if isinstance(value, dict) and "_target_" in value

@@ -1,11 +1,11 @@
-"""A run directory: the one place that knows the names of its files.
+"""The names of the files in a run directory.
 
 .hydra/config.yaml      the configuration, with the number of its format
-.hydra/overrides.yaml   the settings that were typed
-metrics.csv             rows of metrics over updates
-summary.json            the numbers of the final evaluation
-evaluation.json         those of a later `python -m pirl_rl.evaluate`
-checkpoints/            last.pt, from which the run goes on, and weights-<update>.pt
+.hydra/overrides.yaml   the overrides of the command line
+metrics.csv             one row of metrics for each logged update
+summary.json            the metrics of the final evaluation, and the length of the training
+evaluation.json         the metrics of a later `python -m pirl_rl.evaluate`
+checkpoints/            last.pt, from which the run can be resumed, and weights-<update>.pt with the networks
 figures/                PNG files
 """
 
@@ -17,11 +17,11 @@ from pathlib import Path
 from pirl_rl.errors import CheckpointError, ConfigError
 
 FORMAT = 2
-"""Version of what a run directory holds, the key `format` of its configuration; 1 where that has no such key."""
+"""The number of the current format, the key `format` of the configuration. A configuration without it has format 1."""
 
 
 class RunDirectory:
-    """Paths of the files of one run; nothing is created, and a file need not exist.
+    """Paths of the files of a run. Nothing is created, and the files need not exist.
 
     Args:
         path: the directory.
@@ -71,7 +71,7 @@ class RunDirectory:
 
     @property
     def last(self) -> Path:
-        """The checkpoint from which the run goes on."""
+        """The checkpoint from which the run can be resumed."""
         return self.path / self.LAST
 
     @property
@@ -79,19 +79,19 @@ class RunDirectory:
         return self.path / self.FIGURES
 
     def weights(self, update: int) -> Path:
-        """The networks alone, as they were after an update."""
+        """The file with the networks after an update."""
         return self.checkpoints / f"weights-{update:09d}.pt"
 
     def newest(self) -> Path:
-        """The file with the run's last networks: `last.pt`, or in an exported directory the last `weights-*.pt`."""
+        """The file with the latest networks: `last.pt` or, in an exported directory, the last `weights-*.pt`."""
         kept = sorted(self.checkpoints.glob("weights-*.pt"))
         return kept[-1] if kept and not self.last.exists() else self.last
 
     def checkpoint(self, name: str) -> Path:
-        """The file of that name among the checkpoints.
+        """The checkpoint with a file name.
 
         Raises:
-            CheckpointError: the name leads elsewhere.
+            CheckpointError: if the name is no plain file name.
         """
         if name in ("", "..") or Path(name).name != name:
             raise CheckpointError(f"weights: expected the name of a file in {self.checkpoints}, got {name}")
@@ -99,16 +99,16 @@ class RunDirectory:
 
     @classmethod
     def of_checkpoint(cls, path: Path) -> RunDirectory:
-        """The run that a file in `checkpoints/` belongs to."""
+        """The run directory of a file in `checkpoints/`."""
         return cls(path.parent.parent)
 
     def refuse_links(self) -> None:
-        """Refuse a directory from elsewhere that would make us write outside it.
+        """Refuse a directory whose links would make this program write outside it.
 
         Raises:
-            ConfigError: naming a link that leads out of it.
+            ConfigError: with the link that leads out of it.
         """
         root = self.path.resolve()
         for path in self.path.rglob("*"):
             if path.is_symlink() and not path.resolve().is_relative_to(root):
-                raise ConfigError(f"{path} leads out of the run directory, to {path.resolve()}")
+                raise ConfigError(f"{path}: expected no link that leads out of the run directory, to {path.resolve()}")

@@ -1,4 +1,4 @@
-"""`python -m pirl_rl.sweeps`: see `pirl_rl.runs.sweeps`."""
+"""`python -m pirl_rl.sweeps`, see `pirl_rl.runs.sweeps`."""
 
 from pirl_rl.runs.sweeps import main
 

@@ -1,6 +1,6 @@
 """`python -m pirl_rl.train`, see `pirl_rl.commands.train`; `pirl_rl.train(...)`, see `pirl_rl.api.train`.
 
-The command and the function have one name, so that this module is both: called, it is the function.
+The command and the function have the same name. So this module can be called, which calls the function.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""`python -m pirl_rl.tune`: see `pirl_rl.commands.tune`."""
+"""`python -m pirl_rl.tune`, see `pirl_rl.commands.tune`."""
 
 from pirl_rl.commands.tune import main
 

@@ -16,7 +16,7 @@ from rounds import after, history, improves, request
 from pirl_rl.errors import AdvisorError, PlanError
 from pirl_rl.outer_loop.advisors.command import TAIL, Command
 from pirl_rl.outer_loop.parsing import parse_plan
-from pirl_rl.outer_loop.prompt import asked
+from pirl_rl.outer_loop.prompt import request_text
 
 AGENT = (Path(__file__).parent / "agent.py").read_text()
 
@@ -55,8 +55,8 @@ def test_a_program_is_told_what_was_wrong(program, folder):
     again = replace(request(history(), folder), errors=["candidates: expected exactly 2,\n# got 1"])
     assert json.loads(program(AGENT).propose(again))["round_note"] == "again"
     copy = program("import shutil, sys; shutil.copy(*sys.argv[1:])")
-    assert copy.propose(again) == asked(again)
-    assert "- candidates: expected exactly 2, # got 1\n" in asked(again)
+    assert copy.propose(again) == request_text(again)
+    assert "- candidates: expected exactly 2, # got 1\n" in request_text(again)
     assert copy.propose(replace(again, errors=())) == again.prompt
 
 
@@ -157,7 +157,7 @@ def test_a_program_s_secrets_are_not_told(program, folder, monkeypatch):
         ("agent {prompt}", r"expected \{plan\}"),
         ("", r"expected \{plan\}"),
         ("agent 'open {plan}", "No closing quotation"),
-        ("no-such-program-here {plan}", "no program no-such-program-here"),
+        ("no-such-program-here {plan}", "expected an executable program, got no-such-program-here"),
     ],
 )
 def test_lines_that_are_no_command(command, message):

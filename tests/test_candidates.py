@@ -16,7 +16,7 @@ from pirl_rl.assembly import start_from
 from pirl_rl.commands.baseline import measure
 from pirl_rl.commands.composition import compose
 from pirl_rl.errors import ConfigError
-from pirl_rl.outer_loop.candidates import Task, job, overrides, quoted, result, settle
+from pirl_rl.outer_loop.candidates import Task, make_job, quoted, read_result, settle, training_overrides
 from pirl_rl.outer_loop.history import Result
 from pirl_rl.outer_loop.plan import Candidate
 from pirl_rl.run_directory import RunDirectory
@@ -29,7 +29,7 @@ def make_task(folder: Path, one: Candidate | None = None, start: Result = BASE) 
 
 def test_command_composes_to_the_plan(tmp_path):
     task = make_task(tmp_path, candidate(collocation_jitter=0.05))
-    config = compose("train", ["+experiment=drift", "seed=9", *overrides(task, ["success"], 7)])
+    config = compose("train", ["+experiment=drift", "seed=9", *training_overrides(task, ["success"], 7)])
     assert config.schedule._target_ == "pirl_rl.schedules.LossSchedule"
     assert (config.schedule.initial, config.schedule.final) == ([1.0, 0.1, 1.0], [1.0, 0.2, 2.0])
     assert (config.schedule.center, config.schedule.steepness) == (50.0, 0.1)
@@ -45,7 +45,7 @@ def test_any_text_can_be_quoted(text):
 
 
 def test_command_as_typed_by_hand_is_in_the_log(tmp_path):
-    one = job(make_task(tmp_path), ["seed=3"], [])
+    one = make_job(make_task(tmp_path), ["seed=3"], [])
     [line] = one.log.read_text().splitlines()
     assert shlex.split(line.removeprefix("$ ")) == list(one.command)
     assert one.command[-1] == f"hydra.run.dir={quoted(tmp_path / 'a')}"
@@ -58,16 +58,16 @@ def test_a_part_without_checkpoint_is_removed_and_links_are_not_followed(tmp_pat
     (precious / "mine").touch()
     task.folder.mkdir(parents=True)
     (task.folder / "metrics.csv").touch()
-    job(task, [], [])
+    make_job(task, [], [])
     assert not task.folder.exists()
     task.folder.symlink_to(precious)
     with pytest.raises(ConfigError, match="link"):
-        job(task, [], [])
+        make_job(task, [], [])
     task.folder.unlink()
     task.folder.mkdir()
     (task.folder / "figures").symlink_to(precious)
     with pytest.raises(ConfigError, match="leads out"):
-        job(task, [], [])
+        make_job(task, [], [])
     assert (precious / "mine").exists()
 
 
@@ -75,24 +75,22 @@ def test_weights_in_force_at_the_end(tmp_path):
     task = make_task(tmp_path, candidate(schedule_center=99.0, collocation_jitter=0.05))
     task.folder.mkdir()
     write_json(task.folder / "summary.json", {"updates": 100, "wall_seconds": 3.0, **QUIET, "td_loss": float("nan")})
-    done = result(task)
+    done = read_result(task)
     assert (done.status, done.checkpoint, done.updates, done.metrics) == ("done", "001/a", 100, QUIET)
-    assert (
-        done.weights
-        == LossSchedule((1.0, 0.1, 1.0), (1.0, 0.2, 2.0), 99.0, 0.1)(99, 100)
-        == (1.0, 0.15000000000000002, 1.5)
-    )
+    schedule = LossSchedule((1.0, 0.1, 1.0), (1.0, 0.2, 2.0), 99.0, 0.1)
+    assert done.weights == schedule(99, 100) == (1.0, 0.15000000000000002, 1.5)
     assert (done.collocation_jitter, done.collocation_replay_share) == (pytest.approx(0.04), 0.9)
     summary = {"updates": 60, "collapsed_at": 60, "rolled_back_to": 30, **QUIET}
     write_json(task.folder / "summary.json", summary)
-    back = result(task)
+    back = read_result(task)
     assert (back.status, back.checkpoint, back.updates) == ("collapsed", "001/a", 30)
     assert back.weights == task.schedule(29, 100)
     write_json(task.folder / "summary.json", {**summary, "rolled_back_to": 0})
-    assert (result(task).updates, result(task).weights, result(task).collocation_jitter) == (0, BASE.weights, 0.03)
+    back = read_result(task)
+    assert (back.updates, back.weights, back.collocation_jitter) == (0, BASE.weights, 0.03)
     write_json(task.folder / "summary.json", {"updates": 100, **QUIET, "reward": float("nan")})
-    assert (result(task).status, result(task).checkpoint) == ("failed", None)
-    assert "reward: expected a finite number, got nan" in result(task).reason
+    assert (read_result(task).status, read_result(task).checkpoint) == ("failed", None)
+    assert "reward: expected a finite number, got nan" in read_result(task).reason
 
 
 def test_failure_is_told_without_paths(tmp_path):
@@ -100,7 +98,7 @@ def test_failure_is_told_without_paths(tmp_path):
     task.log.write_text("much\nerror: /home/me/x.pt does not fit\n")
     settle(task, 1)
     assert json.loads((task.folder / "failed.json").read_text())["log"][-1] == "error: /home/me/x.pt does not fit"
-    failed = result(task)
+    failed = read_result(task)
     assert failed.reason == "exit code 1: error: <path> does not fit"
     assert (failed.status, failed.checkpoint, failed.updates) == ("failed", None, 0)
 

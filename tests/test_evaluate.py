@@ -65,3 +65,8 @@ def test_mistakes_are_named(arguments, told, run, capsys):
         evaluate.main([argument.format(folder=run[0]) for argument in arguments])
     assert stop.value.code == 1
     assert told in capsys.readouterr().err
+
+
+def test_help_is_the_docstring(capsys):
+    evaluate.main(["--help"])
+    assert "python -m pirl_rl.evaluate run=RUN_DIR" in capsys.readouterr().out

@@ -58,3 +58,8 @@ def test_the_command_says_what_it_expects(arguments, capsys):
         main(arguments)
     assert stop.value.code == 1
     assert "expected run=RUN_DIR out=FOLDER" in capsys.readouterr().err
+
+
+def test_help_is_the_docstring(capsys):
+    main(["--help"])
+    assert "python -m pirl_rl.export run=RUN_DIR out=FOLDER" in capsys.readouterr().out

@@ -11,7 +11,7 @@ import torch
 from matplotlib.image import imread
 
 from pirl_rl.figures.comparison import draw_comparison
-from pirl_rl.figures.one_dimensional import draw_value, solve_on_grid
+from pirl_rl.figures.one_dimensional import draw_value, evaluate_on_grid
 from pirl_rl.figures.run import draw_run
 from pirl_rl.figures.training import HELD_OUT, TRAINING, WEIGHTS, draw_training
 from pirl_rl.loggers import read_metrics
@@ -71,7 +71,7 @@ def test_draw_run_writes_readable_figures(problem, names, metrics_path, tmp_path
 
 def test_grid_holds_values_where_it_says():
     solution = random_solution(Reach1D())
-    grid = solve_on_grid(solution, taus=5, states=9)
+    grid = evaluate_on_grid(solution, taus=5, states=9)
     tau, x = torch.tensor([grid.tau[3]]).float(), torch.tensor([[grid.x[7]]]).float()
     assert grid.value[7, 3] == pytest.approx(solution.raw_value(tau, x).item(), abs=1e-6)
     assert grid.control[0, 7, 3] == pytest.approx(solution.policy(tau, x).item(), abs=1e-6)
@@ -79,12 +79,12 @@ def test_grid_holds_values_where_it_says():
 
 
 def test_value_maps_share_limits_and_are_labelled():
-    figure = draw_value(solve_on_grid(random_solution(Reach1D()), 21, 21))
+    figure = draw_value(evaluate_on_grid(random_solution(Reach1D()), 21, 21))
     learned, exact, error = (axes for axes in figure.axes if axes.get_title())
     assert [axes.get_title().split(",")[0] for axes in (learned, exact, error)] == ["Learned V", "Exact V", "|error|"]
     assert learned.collections[0].get_clim() == exact.collections[0].get_clim() == (0, 1)
     assert all("(s)" in axes.get_xlabel() for axes in (learned, exact, error))
-    assert len(draw_value(solve_on_grid(random_solution(Safety1D()), 21, 21)).axes) == 2
+    assert len(draw_value(evaluate_on_grid(random_solution(Safety1D()), 21, 21)).axes) == 2
 
 
 def test_training_curves_skip_empty_cells(metrics_path):

@@ -47,5 +47,5 @@ def test_links_that_lead_out_are_refused(tmp_path):
     (run.path / "inner").symlink_to(run.figures)
     run.refuse_links()
     (run.figures / "outer").symlink_to(tmp_path)
-    with pytest.raises(ConfigError, match=r"figures/outer leads out of the run directory"):
+    with pytest.raises(ConfigError, match=r"figures/outer: expected no link that leads out of the run directory"):
         run.refuse_links()

@@ -225,7 +225,7 @@ def test_a_run_is_never_overwritten(finished, cli):
     before = RunDirectory(finished).config.read_bytes()
     code, text = cli(*QUICK, "seed=5", f"hydra.run.dir={finished}")
     assert code == 1
-    assert "never overwrites" in text
+    assert "no run overwrites files" in text
     assert RunDirectory(finished).config.read_bytes() == before
 
 
@@ -284,7 +284,7 @@ def test_interrupt_saves_and_tells_how_to_go_on(collector, tmp_path):
     child.send_signal(signal.SIGINT)
     text = child.communicate(timeout=60)[1]
     assert child.returncode == 130
-    assert "go on with: python -m pirl_rl.train resume=" in text
+    assert "resume with: python -m pirl_rl.train resume=" in text
     assert "Traceback" not in text
     run = only_run(tmp_path)
     assert load_run(run).update >= 1

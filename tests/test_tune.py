@@ -86,7 +86,7 @@ def test_command_line(cli, trained, tmp_path):
         (["advisor=command"], "advisor.command: a value is missing"),
         (["critic.activation=ReLU"], "ReLU"),
         (["critic.hidden=[8]"], "does not fit"),
-        (["out=."], "not empty and no loop's directory"),
+        (["out=."], "out: expected an empty directory or one with tune.yaml"),
         (["seed=1,2", "-m"], "-m: a loop runs its candidates itself"),
     ],
     ids=lambda value: value[-1] if isinstance(value, list) else "",
@@ -115,6 +115,6 @@ def test_a_program_s_line_is_typed_as_for_any_shell(cli, trained, tmp_path):
 
 def test_report_needs_a_loop(cli, tmp_path):
     code, text = cli("--report", f"out={tmp_path}")
-    assert (code, "no loop's directory" in text) == (1, True)
+    assert (code, "expected a directory with tune.yaml" in text) == (1, True)
     code, text = cli("--report")
     assert (code, "expected out=DIR" in text) == (1, True)

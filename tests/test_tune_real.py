@@ -158,7 +158,7 @@ def test_interrupt_saves_and_tells_how_to_go_on(number, trained, tmp_path):
     loop.send_signal(number)
     text = loop.communicate(timeout=60)[1]
     assert loop.returncode == 130
-    assert "go on with: python -m pirl_rl.tune " in text
+    assert "resume with: python -m pirl_rl.tune " in text
     assert "Traceback" not in text
     assert (run.parent / "raise-1.log").read_text().count("resume=") == 1
     assert not (run / "failed.json").exists()

@@ -1,1 +1,1 @@
-"""The commands: the only modules that know Hydra."""
+"""The commands, `python -m pirl_rl.train` and the others. No other modules know Hydra."""

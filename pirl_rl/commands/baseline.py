@@ -1,4 +1,4 @@
-"""The baseline of an outer loop: the checkpoint from which all candidates go on, measured as each of them will be."""
+"""The baseline of an outer loop: the checkpoint from which it starts, evaluated like each of its candidates."""
 
 from __future__ import annotations
 
@@ -26,17 +26,18 @@ def measure(trainer: Trainer, path: Path, trust: Sequence[str] = ()) -> Result:
     """Evaluate the start of a loop.
 
     Args:
-        trainer: a candidate's, with the networks of the start.
-        path: the start's checkpoint, in its run directory.
-        trust: modules outside the package that its configuration may name.
+        trainer: the trainer of a candidate, with the networks of the start.
+        path: checkpoint of the start, in its run directory.
+        trust: modules outside the package that the start's configuration may name.
 
     Raises:
-        ConfigError: the run's configuration cannot be built, or it has no finite reward and calibration.
+        ConfigError: if the start's configuration cannot be built, its reward or calibration is not finite, or it ended
+            with settings that no plan can have.
     """
     measured = metrics_of(evaluate(trainer.solution, trainer.simulator, trainer.final))
     metrics = {name: value for name, value in measured.items() if math.isfinite(value)}
     if missing := [name for name in JUDGED if name not in metrics]:
-        raise ConfigError(f"start: expected finite {', '.join(missing)} of {path}, and there is none to compare with")
+        raise ConfigError(f"start: expected finite {', '.join(missing)} to compare candidates with, got none of {path}")
     try:
         return Result(checkpoint=START, metrics=metrics, **_in_force(path, trainer, trust))
     except ValidationError as error:
@@ -44,10 +45,10 @@ def measure(trainer: Trainer, path: Path, trust: Sequence[str] = ()) -> Result:
 
 
 def _in_force(path: Path, trainer: Trainer, trust: Sequence[str]) -> dict[str, Any]:
-    """Weights and settings of the collocation at the start's last update, by its own run's configuration.
+    """Loss weights and collocation settings at the last update of the start, from the configuration of its run.
 
-    Where the candidates' collocation has no such settings there are none; where only the start's had none, they begin
-    with the candidates' own.
+    If the collocation of the candidates has no jitter and replay share, there are no such settings. If only that of the
+    start has none, the initial values of the candidates' collocation are taken.
     """
     config = load_config(RunDirectory.of_checkpoint(path).path)
     config.device, before = "cpu", make_trainer(config, None, trust)
@@ -65,6 +66,6 @@ def _in_force(path: Path, trainer: Trainer, trust: Sequence[str]) -> dict[str, A
 
 
 def _update(state: Mapping[str, Any]) -> int:
-    """Which update's networks a checkpoint holds; after a collapse those of an earlier one are back."""
+    """The number of updates of the networks in a checkpoint, which after a collapse are those of an earlier update."""
     rollback = state.get("rollback") or {}
     return rollback["good_at"] if rollback.get("collapsed_at") is not None else state["update"]

@@ -1,4 +1,4 @@
-"""What Hydra calls around a multirun."""
+"""Callbacks that Hydra calls before and after a sweep."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 
 
 class TidySweep(Callback):
-    """A sweep of which no job began, as with a mistyped setting, leaves no directory."""
+    """Removes the directory of a sweep if no job of it started, for example because of a mistyped setting."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         atexit.register(_remove_if_bare, Path(config.hydra.sweep.dir).absolute())
@@ -24,4 +24,4 @@ def _remove_if_bare(folder: Path) -> None:
         with contextlib.suppress(OSError):
             folder.rmdir()
             for parent in (folder.parent, folder.parent.parent):
-                parent.rmdir()  # empty ones only
+                parent.rmdir()  # fails for a folder that is not empty

@@ -1,4 +1,4 @@
-"""`python -m pirl_rl`: what there is to train, and how."""
+"""The list of problems, choices and commands that `python -m pirl_rl` prints."""
 
 from __future__ import annotations
 
@@ -9,15 +9,19 @@ from pirl_rl import problems
 from pirl_rl.configuration import CONF
 
 COMMANDS = (
-    ("python -m pirl_rl.train +experiment=reach1d", "train; any setting follows as key=value, -m sweeps over several"),
+    (
+        "python -m pirl_rl.train +experiment=reach1d",
+        "train; settings follow as key=value, and -m sweeps over several values",
+    ),
     ("python -m pirl_rl.train +experiment=own env.problem._target_=my_module.MyProblem", "train on your own problem"),
-    ("python -m pirl_rl.train resume=RUN_DIR", "go on with a run"),
-    ("python -m pirl_rl.train +experiment=reach1d start=RUN_DIR", "begin from another run's networks"),
+    ("python -m pirl_rl.train resume=RUN_DIR", "resume a run"),
+    ("python -m pirl_rl.train +experiment=reach1d start=RUN_DIR", "start a new run with the networks of another run"),
     ("python -m pirl_rl.train +experiment=reach1d --cfg job", "show all settings"),
-    ("python -m pirl_rl.evaluate run=RUN_DIR", "evaluate a run again, with other samples or simulators if asked"),
-    ("python -m pirl_rl.tune +experiment=reach1d start=RUN_DIR", "go on from a run in rounds that an advisor plans"),
-    ("python -m pirl_rl.compare RUN_DIRS", "one table and one figure of many runs"),
-    ("python -m pirl_rl.sweeps DIR", "a table and a heat map of a sweep"),
+    ("python -m pirl_rl.evaluate run=RUN_DIR", "evaluate a run again, also with other samples or simulators"),
+    ("python -m pirl_rl.tune +experiment=reach1d start=RUN_DIR", "continue a run in rounds that an advisor plans"),
+    ("python -m pirl_rl.export run=RUN_DIR out=FOLDER", "copy the networks and the results of a run"),
+    ("python -m pirl_rl.compare RUN_DIRS", "compare runs in one table and one figure"),
+    ("python -m pirl_rl.sweeps DIR", "draw a table and a heat map of a sweep"),
 )
 GROUPS = {
     "experiment": "experiments, +experiment=NAME",
@@ -48,6 +52,6 @@ def _first_line(cls: type) -> str:
 
 
 def _comment(path: Path) -> str:
-    """The first comment of a YAML file that is no directive of Hydra's."""
+    """The first comment of a YAML file that is not a directive of Hydra."""
     lines = path.read_text(encoding="utf-8").splitlines()
     return next((line[2:] for line in lines if line.startswith("# ") and "@package" not in line), "")

@@ -1,7 +1,7 @@
-"""Composition: the configuration of a run, put together by Hydra from `conf/` and from what is typed.
+"""Composition of a configuration by Hydra, from `conf/` and the overrides on the command line.
 
 A node of `conf/` that starts from `/arguments/<class>@...` has every argument of that class's constructor as a key,
-with the constructor's default: a value stands in one place, and plain `key=value` reaches it.
+with the constructor's default. So a default is written in one place, and a plain `key=value` can override it.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ SUPPLIED = frozenset(
         *("td_weight", "hjb_weight", "boundary_weight"),
     ]
 )
-"""Constructor arguments that `pirl_rl.assembly` supplies, or that the schedule moves: no configuration holds them."""
+"""Constructor arguments that no configuration holds: `pirl_rl.assembly` supplies them, or the schedule sets them."""
 
 SEEDED = frozenset(("device", "env", "learner"))
-"""A constructor with one of these arguments gets its `seed` from the run's."""
+"""A constructor with one of these arguments gets its `seed` from `pirl_rl.assembly` too."""
 
 
 def arguments(target: str) -> dict[str, Any]:
-    """A configuration node of a class: each argument with its default, or as missing where it has none."""
+    """The configuration node of a class: each constructor argument with its default, or as missing if it has none."""
     constructor = resolve(target, target)
     parameters = parameters_of(constructor)
     left_out = SUPPLIED | ({"seed"} if SEEDED & parameters.keys() else set())
@@ -47,7 +47,7 @@ def arguments(target: str) -> dict[str, Any]:
 
 @cache
 def register() -> None:
-    """Make known to Hydra the constructors that `conf/` refers to."""
+    """Register the nodes of all constructors that `conf/` refers to with Hydra."""
     store = ConfigStore.instance()
     for path in sorted(CONF.rglob("*.yaml")):
         for target in REFERENCE.findall(path.read_text(encoding="utf-8")):
@@ -78,14 +78,14 @@ def drop_leftovers(config: DictConfig, typed: Sequence[str], trust: Sequence[str
 
 
 def compose(name: str, overrides: Sequence[str], with_hydra: bool = False) -> DictConfig:
-    """A configuration from one of the primary files of `conf/`, "train" or "tune", and typed overrides.
+    """Compose a configuration from a primary file of `conf/` and overrides.
 
-    A Hydra that is at work already, as around a command or a script of the user's, is back afterwards.
+    An active Hydra, such as that of a command or of the user's script, is restored afterwards.
 
     Args:
-        name: of the primary file.
-        overrides: `key=value`, as on a command line.
-        with_hydra: whether the configuration keeps Hydra's own settings, under `hydra`.
+        name: the primary file, "train" or "tune".
+        overrides: overrides `key=value`, as on a command line.
+        with_hydra: whether the configuration contains the settings of Hydra, under `hydra`.
     """
     register()
     active = GlobalHydra.instance().hydra

@@ -1,4 +1,4 @@
-"""What the commands share: overrides of a run's settings, the table of metrics, and how errors are reported."""
+"""Parts that the commands share: overrides of a run's settings, the table of metrics, and the report of errors."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from pirl_rl.configuration import PACKAGE
 from pirl_rl.errors import INTERRUPTED, ConfigError, Interrupted, PirlError
 
 EXPECTED = (PirlError, HydraException, OmegaConfBaseException)
-"""Errors that are the user's to mend: their message is enough."""
+"""Errors whose message alone tells the user what to correct."""
 
 LIBRARIES = tuple(
     Path(path).resolve()
     for path in (PACKAGE, sysconfig.get_path("stdlib"), sysconfig.get_path("purelib"), *site.getsitepackages())
 )
-"""Folders of code that is not the user's."""
+"""Folders whose code is not the user's."""
 
 
 def quiet_libraries() -> None:
-    """Silence what libraries warn of about each other while they compile, which no user can mend."""
+    """Silence the warnings of torch and TorchRL about each other, about which a user can do nothing."""
     warnings.filterwarnings("ignore", category=FutureWarning, module=r"(torch|tensordict|torchrl)\b")
 
 
 def metrics_table(summary: Mapping[str, float], meanings: Mapping[str, str]) -> str:
-    """The numbers of a summary with the meanings of those that are metrics."""
+    """A table of the entries of a summary, with the meanings of the metrics among them."""
     rows = []
     for name, value in summary.items():
         first, *others = textwrap.wrap(meanings.get(name, ""), 84) or [""]
@@ -45,16 +45,16 @@ def metrics_table(summary: Mapping[str, float], meanings: Mapping[str, str]) -> 
 
 
 def named_modules(overrides: Sequence[str]) -> list[str]:
-    """The modules of the `_target_`s that were typed."""
+    """The modules of all `_target_`s among the overrides."""
     targets = [value for key, _, value in (item.partition("=") for item in overrides) if key.endswith("_target_")]
     return [target.partition(".")[0] for target in targets]
 
 
 def override(config: DictConfig, text: str) -> None:
-    """Apply a typed `key=value` to a run's configuration.
+    """Apply an override `key=value` to the configuration of a run.
 
     Raises:
-        ConfigError: it is no such text, or sets more than a single value.
+        ConfigError: if the text is no such override, or sets more than a single setting.
     """
     try:
         parsed = OverridesParser.create().parse_override(text)
@@ -62,21 +62,25 @@ def override(config: DictConfig, text: str) -> None:
         raise ConfigError(f"{text}: {error}") from None
     plain = "=" in text and not text.startswith(("+", "~")) and not parsed.is_sweep_override()
     if not plain or isinstance(OmegaConf.select(config, parsed.key_or_group), DictConfig):
-        raise ConfigError(f"{text}: a finished run takes key=value of single settings only")
+        raise ConfigError(f"{text}: expected key=value of an existing run's single settings only")
     OmegaConf.update(config, parsed.key_or_group, parsed.value())
 
 
 @contextlib.contextmanager
 def reported(folder: Path, one_of_many: bool = False) -> Iterator[None]:
-    """Turn errors into messages and an exit code; in a sweep the other jobs still run.
+    """Turn errors into messages and an exit code.
 
-    What is known to be a misfit is one line. Anything else is a bug, ours or in a class of the user's: its traceback is
-    printed, and a last line that says where in the user's code it happened.
+    An expected error, such as a refused setting, becomes one line. Any other error is a bug in this package or in the
+    user's code: its traceback is printed, with a last line that names the place in the user's code.
+
+    Args:
+        folder: the run directory, for the hint on how to resume.
+        one_of_many: whether this is a job of a sweep, whose other jobs still run.
     """
     try:
         yield
     except Interrupted as stop:
-        print(f"{stop}; go on with: python -m pirl_rl.train resume={folder}", file=sys.stderr)
+        print(f"{stop}; resume with: python -m pirl_rl.train resume={folder}", file=sys.stderr)
         raise SystemExit(INTERRUPTED) from None
     except EXPECTED as error:
         _end(f"error: {_one_line(error)}", one_of_many)

@@ -1,7 +1,7 @@
-"""Evaluate: `python -m pirl_rl.evaluate run=RUN_DIR [evaluation.success.episodes=100000 ...]`.
+"""Evaluate a run again: `python -m pirl_rl.evaluate run=RUN_DIR [evaluation.success.episodes=100000 ...]`.
 
-Runs a finished run's evaluators again, with other samples or simulators if asked, leaves `evaluation.json` in it and
-draws its figures.
+Calls the final evaluators of the run, with the changed settings, writes their metrics to `evaluation.json` in the run
+directory, and draws its figures.
 """
 
 from __future__ import annotations
@@ -24,6 +24,9 @@ from pirl_rl.runs.load import load_run
 
 def main(arguments: Sequence[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
+    if {"-h", "--help"} & {*arguments}:
+        print(__doc__)
+        return
     named = [item for item in arguments if item.startswith("run=")]
     folder = Path(named[-1].partition("=")[2]) if named else Path()
     run = RunDirectory(folder)

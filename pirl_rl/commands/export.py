@@ -1,7 +1,7 @@
-"""Export: `python -m pirl_rl.export run=RUN_DIR out=FOLDER`.
+"""Export a run: `python -m pirl_rl.export run=RUN_DIR out=FOLDER`.
 
-Copies what `load_run` and a reader need of a run: the weights without targets, buffer and optimisers, the
-configuration, the summary, the metrics and the figures.
+Copies the files that `load_run` and a reader need: the networks without target networks, replay buffer and optimisers,
+the configuration, the summary, the metrics and the figures.
 """
 
 from __future__ import annotations
@@ -22,20 +22,27 @@ COPIED = (RunDirectory.SUMMARY, RunDirectory.EVALUATION, RunDirectory.METRICS, R
 
 
 def export(run: Path, out: Path) -> Path:
-    """Write the folder, which must be new; returns the file of the weights.
+    """Export a run to a new folder.
+
+    Args:
+        run: the run directory.
+        out: the folder, which must not exist.
+
+    Returns:
+        The path of the exported networks.
 
     Raises:
-        ConfigError: not a run directory, or a folder that exists.
-        CheckpointError: no checkpoint, or a broken one.
+        ConfigError: if `run` is not a run directory, or `out` exists.
+        CheckpointError: if the checkpoint is missing or broken.
     """
     config = load_config(run)
     source, copy = RunDirectory(run), RunDirectory(out)
     state = checkpoint.load(source.newest())
     source.refuse_links()
     if out.exists():
-        raise ConfigError(f"out: {out} exists, and an export never overwrites anything")
+        raise ConfigError(f"out: expected a new folder, but {out} exists, and an export never overwrites anything")
     if "start" in config:
-        config.start = None  # a path of this machine
+        config.start = None  # a path that means nothing elsewhere
     save_config(config, out)
     loss = {name: entry for name, entry in checkpoint.loss_state(state).items() if not name.startswith(TARGET)}
     path = copy.weights(state["update"])
@@ -50,6 +57,9 @@ def export(run: Path, out: Path) -> Path:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
+    if {"-h", "--help"} & {*arguments}:
+        print(__doc__)
+        return
     named = dict(item.split("=", 1) for item in arguments if "=" in item)
     with reported(Path(named.get("run", "."))):
         if set(named) != {"run", "out"} or len(named) != len(arguments):

@@ -1,4 +1,4 @@
-"""What a method owns: the settings that `conf/method/<name>.yaml` states, which no experiment may change in silence."""
+"""The settings of `conf/method/<name>.yaml`, which the method owns, and the check that no experiment changes them."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ from pirl_rl.configuration import CONF
 from pirl_rl.errors import ConfigError
 
 NO_SETTINGS = ("defaults", "method_name")
+"""Keys of a method's file that are no settings."""
 
 
 def check_method(config: DictConfig, typed: Sequence[str]) -> None:
-    """Refuse an experiment that is not made for the chosen method, or that changes what the method owns.
+    """Refuse an experiment that is not made for the chosen method, or that changes a setting of the method.
 
     Args:
-        config: as composed, references unresolved.
-        typed: the overrides that were typed; what a person types is on purpose.
+        config: the composed configuration with unresolved references.
+        typed: the overrides on the command line, which may change settings of the method.
 
     Raises:
-        ConfigError: with the method, and the experiments for which it works or the setting that was changed.
+        ConfigError: with the methods of the experiment, or with the setting that it would change.
     """
     method, experiment = config.method_name, config.experiment_name
     if config.methods is not None and method not in config.methods:
@@ -41,10 +42,12 @@ def check_method(config: DictConfig, typed: Sequence[str]) -> None:
 
 
 def owned(method: str) -> list[tuple[str, Any]]:
-    """The settings of a method with their keys; what it leaves to experiments, under its own name, is none of them.
+    """The settings that a method owns, as pairs of key and value.
+
+    A block with the name of a method holds values that experiments may set, so its entries are not owned.
 
     Args:
-        method: name of a file of `conf/method`; a method from elsewhere owns nothing.
+        method: name of a file of `conf/method`; a method without a file there owns nothing.
     """
     path = CONF / "method" / f"{method}.yaml"
     if not path.is_file():
@@ -55,7 +58,7 @@ def owned(method: str) -> list[tuple[str, Any]]:
 
 
 def _settings(path: Path) -> dict[str, Any]:
-    """A method's file over those that it starts from."""
+    """The entries of a method's file, merged over those of the files in its defaults list."""
     own = OmegaConf.load(path)
     assert isinstance(own, DictConfig)
     bases = [name for name in own.get("defaults", []) if name != "_self_"]

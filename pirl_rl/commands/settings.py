@@ -1,4 +1,4 @@
-"""Settings that are given in Python, as the overrides that Hydra's command line takes, and what they compose to."""
+"""Settings that are Python arguments: their translation to overrides of Hydra, and the composed configuration."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from pirl_rl.errors import ConfigError
 from pirl_rl.outer_loop.candidates import quoted
 
 WORD = re.compile(r"(?!(?:null|true|false|inf|nan|on|off|yes|no)$)[A-Za-z_][\w./-]*", re.IGNORECASE)
-"""Text that Hydra reads as itself without quotes."""
+"""Text that Hydra reads as a string without quotes."""
 
 
 def compose_run(experiment: str, settings: Mapping[str, Any]) -> tuple[DictConfig, list[str]]:
-    """The configuration of a new run.
+    """Compose the configuration of a new run.
 
     Args:
-        experiment: its name.
-        settings: names with dots, nested mappings, choices of groups, or names of the trainer's arguments.
+        experiment: name of the experiment.
+        settings: values by keys with dots, nested mappings, choices of groups, or arguments of the trainer.
 
     Returns:
-        The configuration, `hydra` included, and the same settings as a command line would have them.
+        The configuration, with the settings of Hydra under `hydra`, and the overrides of an equal command line.
 
     Raises:
-        ConfigError: an unknown name or choice, or a value that no configuration can hold.
+        ConfigError: for an unknown name or choice, or a value that no configuration can hold.
     """
     groups = {path.name for path in CONF.iterdir() if path.is_dir()}
     try:
@@ -41,8 +41,8 @@ def compose_run(experiment: str, settings: Mapping[str, Any]) -> tuple[DictConfi
         listed = base.hydra.runtime.choices
         typed = [f"+experiment={experiment}"]
         typed += [f"{name if name in listed else f'+{name}'}={value}" for name, value in chosen.items()]
-        rest = {name: value for name, value in settings.items() if name not in chosen}
-        typed += typed_settings(rest, compose("train", typed), "trainer", groups)
+        others = {name: value for name, value in settings.items() if name not in chosen}
+        typed += typed_settings(others, compose("train", typed), "trainer", groups)
         return compose("train", typed, with_hydra=True), typed
     except HydraException as error:
         raise ConfigError(str(error)) from error
@@ -51,7 +51,7 @@ def compose_run(experiment: str, settings: Mapping[str, Any]) -> tuple[DictConfi
 
 
 def run_folder(config: DictConfig) -> str:
-    """Where Hydra's command line would put the run; takes `hydra` out of the configuration."""
+    """The run directory that Hydra's command line would choose; removes `hydra` from the configuration."""
     folder = config.hydra.run.dir
     with open_dict(config):
         del config["hydra"]
@@ -61,16 +61,16 @@ def run_folder(config: DictConfig) -> str:
 def typed_settings(
     settings: Mapping[str, Any], config: DictConfig, short: str, groups: Sequence[str] | set[str] = ()
 ) -> list[str]:
-    """Settings as overrides, `key=value`.
+    """Translate settings to overrides `key=value`.
 
     Args:
-        settings: names with dots, or nested mappings.
-        config: where each of them has to be, unless a new `_target_` stands beside it.
-        short: the node whose entries may be named without it.
-        groups: further names, for the message alone.
+        settings: values by keys with dots, or nested mappings.
+        config: the configuration, which must have each key unless the same mapping sets a new `_target_`.
+        short: the node whose entries may be named without its name, such as "trainer".
+        groups: names of groups, which the error message lists too.
 
     Raises:
-        ConfigError: an unknown name, with those that are known.
+        ConfigError: for an unknown key; the message lists the known ones.
     """
     texts = []
     for name, value in settings.items():
@@ -87,30 +87,31 @@ def typed_settings(
 
 
 def _texts(key: str, value: Any, config: DictConfig, free: bool = False) -> list[str]:
-    """The overrides of one setting, those of its entries where it is a mapping."""
+    """The override of a setting or, for a mapping, those of its entries; `free` allows keys that `config` lacks."""
     if isinstance(value, Mapping):
         free = free or "_target_" in value
         return [text for name, entry in value.items() for text in _texts(f"{key}.{name}", entry, config, free)]
     if not free:
-        _check(key, config)
+        _check_key(key, config)
     return [f"{'++' if free else ''}{key}={_literal(value, key)}"]
 
 
-def _check(key: str, config: DictConfig) -> None:
-    """
+def _check_key(key: str, config: DictConfig) -> None:
+    """Refuse a key that the configuration does not have.
+
     Raises:
-        ConfigError: naming the part of the key that the configuration does not have, and its neighbours.
+        ConfigError: with the unknown part of the key and the names that are known in its place.
     """
     node: Any = config
     for count, part in enumerate(parts := key.split("."), 1):
-        if not isinstance(node, DictConfig) or part not in node.keys():  # even without a value
+        if not isinstance(node, DictConfig) or part not in node.keys():  # `in node` is False for a missing value
             known = ", ".join(str(name) for name in node) if isinstance(node, DictConfig) else "no more names"
             raise ConfigError(f"{'.'.join(parts[:count])}: expected one of {known}")
         node = node._get_node(part)
 
 
 def _literal(value: Any, key: str) -> str:
-    """A value as Hydra's grammar spells it."""
+    """Write a value in the grammar of Hydra's overrides."""
     if isinstance(value, np.generic):
         value = value.item()
     if value is None:

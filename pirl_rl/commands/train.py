@@ -1,5 +1,5 @@
-"""Train: `python -m pirl_rl.train +experiment=reach1d [method=...] [start=CHECKPOINT] [key=value ...]`, or
-`resume=RUN_DIR`.
+"""Train a new run, `python -m pirl_rl.train +experiment=reach1d [method=...] [start=CHECKPOINT] [key=value ...]`, or
+resume one, `python -m pirl_rl.train resume=RUN_DIR [key=value ...]`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from pirl_rl.trainer import Trainer
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")
 def train(config: DictConfig) -> float:
-    """A new run in Hydra's run directory; returns the metric that a sweep may minimise."""
+    """Train a new run in Hydra's run directory; returns the error that an optimising sweeper can minimise."""
     hydra_config = HydraConfig.get()
     folder = Path(hydra_config.runtime.output_dir)
     with reported(folder, one_of_many=hydra_config.mode == RunMode.MULTIRUN):
@@ -45,26 +45,27 @@ def train_new(
     trust: Sequence[str] = (),
     problem: ReachAvoidProblem | None = None,
 ) -> dict[str, float]:
-    """Train from the first update on, into a run directory of its own; returns the summary.
+    """Train a new run in a new run directory; returns the summary.
 
     Args:
-        config: all settings.
+        config: the configuration.
         folder: the run directory, new or empty.
-        overrides: the settings that were typed, for the record; modules that they name are trusted.
-        trust: more modules outside the package that the configuration may name.
-        problem: what is trained on in place of `env.problem`.
+        overrides: the overrides of the user, which are recorded; the modules that they name are trusted.
+        trust: further modules outside the package that the configuration may name.
+        problem: replaces `env.problem`.
 
     Raises:
-        PirlError: settings that cannot be built, or a training that diverged or was interrupted.
+        PirlError: if the configuration cannot be built, or training diverges or is interrupted.
     """
     with _new(folder):
-        # What the user types is trusted; what a directory from elsewhere says is not.
+        # Modules that the user names are trusted; those that a run directory names are not, since it may be foreign.
         check_method(config, overrides)
         trust = [*config.trust, *named_modules(overrides), *trust]
         drop_leftovers(config, overrides, trust)
         trainer = make_trainer(config, folder, trust, problem)
         if config.start is not None:
-            # On record as a file wherever one stands: what was typed may be relative, or a run that goes on.
+            # The absolute path of the file is recorded: the typed path may be relative, or that of a run directory
+            # whose newest checkpoint changes when the run is resumed.
             if not isinstance(config.start, str):
                 raise ConfigError(f"start: expected the path of a run or a checkpoint, got {config.start!r}")
             config.start = str(start_from(trainer, config.start))
@@ -74,14 +75,14 @@ def train_new(
 
 
 def resume(folder: Path, overrides: Sequence[str]) -> None:
-    """Go on in a run directory, with plain `key=value` overrides of its configuration, which keeps them."""
+    """Resume a run, with overrides `key=value` that change its configuration for good."""
     with reported(folder):
         config = load_config(folder)
         RunDirectory(folder).refuse_links()
         config.trust = []
         for text in overrides:
             if text.startswith("start="):
-                raise ConfigError(f"{text}: the run has begun already; a new run starts from there, without resume")
+                raise ConfigError(f"{text}: the run has begun already; start= is for new runs, without resume=")
             override(config, text)
         trainer = make_trainer(config, folder, [*config.trust, *named_modules(overrides)])
         restore(trainer)
@@ -102,10 +103,16 @@ def _train(trainer: Trainer) -> dict[str, float]:
 
 @contextlib.contextmanager
 def _new(folder: Path) -> Iterator[None]:
-    """Nothing is overwritten, and a run that ends before its first row or checkpoint leaves nothing behind."""
+    """Create a run directory. It is removed if the run ends before its first row of metrics or checkpoint.
+
+    Raises:
+        ConfigError: if the directory is not empty.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     if any(folder.iterdir()):
-        raise ConfigError(f"hydra.run.dir: {folder} is not empty, and a run never overwrites anything")
+        raise ConfigError(
+            f"hydra.run.dir: expected an empty directory, but {folder} is not empty, and no run overwrites files"
+        )
     run = RunDirectory(folder)
     try:
         yield
@@ -114,7 +121,7 @@ def _new(folder: Path) -> Iterator[None]:
             shutil.rmtree(folder)
             for parent in (folder.parent, folder.parent.parent):
                 with contextlib.suppress(OSError):
-                    parent.rmdir()  # empty ones only
+                    parent.rmdir()  # fails for a folder that is not empty
         raise
 
 
@@ -130,5 +137,5 @@ def main() -> None:
             register()
             train()
     except KeyboardInterrupt:
-        print("stopped at once; what the last checkpoint holds is kept", file=sys.stderr)
+        print("stopped at once; only the updates up to the last checkpoint are kept", file=sys.stderr)
         sys.exit(INTERRUPTED)

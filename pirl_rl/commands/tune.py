@@ -1,7 +1,7 @@
 """Tune: `python -m pirl_rl.tune +experiment=reach1d start=RUN [advisor=NAME] [rounds=3] [candidates=2] [out=DIR] ...`.
 
-Rounds of continuations, each planned by an advisor. Started again with the same `out` it goes on where it was; with
-`--report out=DIR` it only draws what there is.
+Continues a run in rounds, each planned by an advisor. A command with the `out` of a stopped loop resumes that loop, and
+`--report out=DIR` writes the report of a loop, finished or not, without training.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from pirl_rl.commands.console import named_modules, quiet_libraries, reported
 from pirl_rl.configuration import CONF, build, convert
 from pirl_rl.errors import INTERRUPTED, ConfigError
 from pirl_rl.files import replacing
-from pirl_rl.outer_loop.candidates import LEADING, Task, overrides, quoted
-from pirl_rl.outer_loop.directory import KEPT, check, locked
+from pirl_rl.outer_loop.candidates import LEADING, Task, quoted, training_overrides
+from pirl_rl.outer_loop.directory import SETTINGS_FILE, check_directory, locked
 from pirl_rl.outer_loop.history import Result, tolerance
 from pirl_rl.outer_loop.loop import Loop, LoopSettings
 from pirl_rl.outer_loop.plan import START, Candidate
@@ -39,39 +39,39 @@ from pirl_rl.run_directory import RunDirectory
 from pirl_rl.trainer import Trainer
 
 COUNTS = {"rounds": 1, "extra_rounds": 0, "candidates": 1, "updates": 1, "parallel": 1}
-"""Settings of the loop that are integers, with the least value of each."""
+"""Settings of the loop that are integers, with the smallest value of each."""
 
 OWN = ("start", "out", "advisor", *COUNTS)
-"""Settings of the loop itself; all others are those of its candidates."""
+"""Settings of the loop; all others belong to the training of its candidates."""
 
 PLANNED = ("schedule", "stages", "resume", "trainer.updates", "evaluation.final")
-"""Settings that the loop itself gives to its candidates, and that nobody may type."""
+"""Settings that the loop sets for each candidate, so that they are refused on the command line."""
 
 EVALUATIONS = 10
-"""Least number of evaluations during a candidate's training: between them the guard cannot see a collapse."""
+"""Smallest number of evaluations during a candidate's training. The guard detects a collapse at evaluations only."""
 
 JUDGES = ("success", "residuals", "calibration")
-"""Evaluators that judge the baseline and the candidates."""
+"""Evaluators that the baseline and the candidates are compared by."""
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="tune")
 def tune(config: DictConfig) -> None:
-    """A loop in `out`, from its beginning or from where it was."""
+    """Start or resume the loop in `out`."""
     typed = HydraConfig.get().overrides.task
     out = Path(HydraConfig.get().runtime.output_dir)
     with reported(out), _tidy(out), _resumable(out):
         counts = {name: _count(config, name) for name in COUNTS}
-        train = [*_for_training(typed), *_often_enough(config)]
+        train = [*_for_training(typed), *_frequent_evaluation(config)]
         trust = [*config.trust, *named_modules(typed)]
         advisor = build(config.advisor, "advisor", trust)
         trainer, path, final = _first(config, train, trust)
         config.start = str(path)
         kept = redact(OmegaConf.to_container(config, resolve=True))
-        check(out, kept)
+        check_directory(out, kept)
         with locked(out) as lock:
-            check(out, kept)
-            if not (out / KEPT).exists():
-                with replacing(out / KEPT) as file:
+            check_directory(out, kept)
+            if not (out / SETTINGS_FILE).exists():
+                with replacing(out / SETTINGS_FILE) as file:
                     file.write(OmegaConf.to_yaml(OmegaConf.create(kept)))
             record = Record(out)
             baseline = record.baseline()
@@ -79,7 +79,7 @@ def tune(config: DictConfig) -> None:
                 print(f"baseline: evaluating {path}", flush=True)
                 baseline = measure(trainer, path, trust)
                 record.write_baseline(baseline)
-            del trainer  # its memory is the candidates'
+            del trainer  # frees its memory for the candidates
             parallel = counts.pop("parallel")
             settings = LoopSettings(**counts, start=path, train=train, trust=trust, final=final, seed=config.seed)
             loop = Loop(settings, record, advisor, Processes(parallel, [lock]))
@@ -88,12 +88,12 @@ def tune(config: DictConfig) -> None:
 
 
 def report(out: Path) -> None:
-    """Draw what there is of a loop, finished or not."""
+    """Write the report of a loop, finished or not."""
     with reported(out):
         RunDirectory(out).refuse_links()
-        if not (out / KEPT).is_file():
-            raise ConfigError(f"out: {out} is no loop's directory, expected {KEPT} in it")
-        settings = OmegaConf.to_container(OmegaConf.load(out / KEPT), resolve=False)
+        if not (out / SETTINGS_FILE).is_file():
+            raise ConfigError(f"out: expected a directory with {SETTINGS_FILE}, which a loop writes, got {out}")
+        settings = OmegaConf.to_container(OmegaConf.load(out / SETTINGS_FILE), resolve=False)
         _report(out, Path(str(settings["start"])))  # type: ignore[index, call-overload]
 
 
@@ -101,7 +101,7 @@ def _report(out: Path, start: Path) -> None:
     record = Record(out)
     baseline = record.baseline()
     if baseline is None:
-        raise ConfigError(f"out: {out} has no baseline yet")
+        raise ConfigError(f"out: expected a loop with a measured baseline, got none in {out}")
     history = record.history(baseline, tolerance(baseline))
     print(f"\n{markdown(history)}")
     for path in write_report(history, out):
@@ -118,10 +118,10 @@ def _count(config: DictConfig, name: str) -> int:
 
 
 def _for_training(typed: Sequence[str]) -> list[str]:
-    """Those of the typed overrides that every candidate's training gets.
+    """The overrides on the command line that belong to the training of every candidate.
 
     Raises:
-        ConfigError: one of what the plans decide.
+        ConfigError: for a setting that the loop sets for each candidate.
     """
     parser, kept = OverridesParser.create(), []
     for text in typed:
@@ -133,8 +133,8 @@ def _for_training(typed: Sequence[str]) -> list[str]:
     return kept
 
 
-def _often_enough(config: DictConfig) -> list[str]:
-    """An experiment made for longer runs is evaluated more often here."""
+def _frequent_evaluation(config: DictConfig) -> list[str]:
+    """An override for experiments that are made for longer runs, with at least `EVALUATIONS` evaluations."""
     every, most = config.trainer.evaluate_every, max(1, config.updates // EVALUATIONS)
     return [f"trainer.evaluate_every={most}"] if isinstance(every, int) and every > most else []
 
@@ -144,10 +144,13 @@ def _within(key: str, name: str) -> bool:
 
 
 def _first(config: DictConfig, train: Sequence[str], trust: Sequence[str]) -> tuple[Trainer, Path, list[str]]:
-    """A candidate's trainer with the start's networks, the start's file, and the names of the evaluators.
+    """The trainer of a candidate with the networks of the start, the file of the start, and the evaluators' names.
+
+    Errors that every candidate would meet are so found before the first round.
 
     Raises:
-        ConfigError, CheckpointError: whatever would end every candidate at once.
+        ConfigError: if a candidate's configuration cannot be built, or an evaluator is missing.
+        CheckpointError: if the start is missing, broken or does not fit the configuration.
     """
     start = convert(config.start, str, "start") if config.start is not None else None
     if not start:
@@ -155,14 +158,15 @@ def _first(config: DictConfig, train: Sequence[str], trust: Sequence[str]) -> tu
     final = [name for name in JUDGES if isinstance(config.evaluation.get(name), DictConfig)]
     if not {"success", "calibration"} <= {*final}:
         raise ConfigError(f"evaluation: expected success and calibration, to judge candidates by, got {final}")
-    candidate = compose("train", [*LEADING, *train, *overrides(_example(config, Path(start)), final, config.seed)])
+    own = training_overrides(_example(config, Path(start)), final, config.seed)
+    candidate = compose("train", [*LEADING, *train, *own])
     drop_leftovers(candidate, train, trust)
     trainer = make_trainer(candidate, None, trust)
     return trainer, start_from(trainer, start), final
 
 
 def _example(config: DictConfig, start: Path) -> Task:
-    """A candidate that no plan has, with every loss in force."""
+    """An arbitrary candidate with positive weights of all losses, to test the settings with."""
     ones = (1.0, 1.0, 1.0)
     plan = Candidate(
         name="any", schedule_initial=ones, schedule_final=ones, schedule_center=0.0, schedule_sharpness=1.0
@@ -172,19 +176,19 @@ def _example(config: DictConfig, start: Path) -> Task:
 
 @contextlib.contextmanager
 def _tidy(out: Path) -> Iterator[None]:
-    """A loop that ends before it wrote anything leaves no directory behind."""
+    """Remove the directory of a loop that ends before it has written a file."""
     try:
         yield
     finally:
         if not any(out.iterdir()):
             for folder in (out, out.parent, out.parent.parent):
                 with contextlib.suppress(OSError):
-                    folder.rmdir()  # empty ones only
+                    folder.rmdir()  # fails for a folder that is not empty
 
 
 @contextlib.contextmanager
 def _resumable(out: Path) -> Iterator[None]:
-    """Ctrl-C and SIGTERM stop the loop and its candidates, and say how it goes on."""
+    """Let Ctrl-C and SIGTERM stop the loop and its candidates, and print the command that resumes it."""
 
     def stop(number, frame):
         raise KeyboardInterrupt
@@ -195,7 +199,7 @@ def _resumable(out: Path) -> Iterator[None]:
     except KeyboardInterrupt as reason:
         again = [*(text for text in sys.argv[1:] if not text.startswith("out=")), f"out={quoted(out)}"]
         print(
-            f"{str(reason) or 'stopped'}; go on with: python -m pirl_rl.tune {shlex.join(again)}",
+            f"{str(reason) or 'stopped'}; resume with: python -m pirl_rl.tune {shlex.join(again)}",
             file=sys.stderr,
             flush=True,
         )
@@ -205,7 +209,7 @@ def _resumable(out: Path) -> Iterator[None]:
 
 
 def _readable(argument: str) -> str:
-    """The line of `advisor.command`, whose quotes a shell has taken away, as Hydra reads it: in quotes."""
+    """Quote the value of `advisor.command` for Hydra, since the shell has removed the user's quotes."""
     key, _, line = argument.partition("=")
     if key.lstrip("+") != "advisor.command":
         return argument

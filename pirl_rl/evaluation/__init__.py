@@ -1,8 +1,8 @@
-"""Evidence about a learned solution: evaluators measure it, and say what each of their metrics means.
+"""Evidence about a learned solution: evaluators measure it and state what each of their metrics means.
 
-All evaluators leave exploration noise out, and every call repeats the one before: they have seeds and random generators
-of their own. One simulator is handed to all of them; `Accuracy`, which compares simulators, has its own. Nothing is
-drawn here, see `pirl_rl.figures`.
+All evaluators play the policy without exploration noise. Each has its own seed, so that repeated calls give the same
+numbers. All get the same simulator, except `Accuracy`, which compares simulators and builds its own. Figures are drawn
+in `pirl_rl.figures`.
 """
 
 from pirl_rl.evaluation.accuracy import Accuracy

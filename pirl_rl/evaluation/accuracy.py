@@ -1,4 +1,4 @@
-"""How far the value is from what its policy attains, on reference states: the paper's table of accuracy."""
+"""The error of the value against Monte Carlo of its policy on reference states, as in the paper's table of accuracy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SIMULATORS: dict[str, dict[str, Any]] = {
     "paper": {"dt": 0.1, "substeps": 1, "crossing": "endpoint"},
 }
 LEVELS = (0.1, 0.5, 0.9)
-"""p of the sets {V > p}."""
+"""The levels p of the sets {V > p} for which precision and recall are computed."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class AccuracyEvidence:
 
     Attributes:
         states: the reference states.
-        reachable: those from which the target can be reached as far as the problem knows, (N,) bool, on the CPU.
-        comparisons: by the name of the simulator.
+        reachable: False where the problem knows that the target is out of reach, (N,) bool, on the CPU.
+        comparisons: V against Monte Carlo under each simulator, by the simulator's name.
     """
 
     states: ReferenceStates
@@ -42,32 +42,36 @@ class AccuracyEvidence:
         return {f"{name}_{key}": value for name in self.comparisons for key, value in self.metrics_under(name).items()}
 
     def metrics_under(self, simulator: str) -> dict[str, float]:
-        """The metrics of one simulator, without its name before theirs."""
-        one = self.comparisons[simulator]
+        """The metrics under one simulator, by names without the simulator's prefix."""
+        comparison = self.comparisons[simulator]
         metrics = {
-            "mse": one.mse(),
-            "mae": one.mae(),
-            "noise": one.noise(),
-            "raw_mse": one.raw_mse(),
-            "mse_band": one.mse(self.reachable),
-            **{f"mse_{group}": one.mse(self.states.group == i) for i, group in enumerate(GROUPS)},
-            "success": one.monte_carlo.mean().item(),
-            "success_band": one.monte_carlo[self.reachable].mean().item(),
+            "mse": comparison.mse(),
+            "mae": comparison.mae(),
+            "noise": comparison.noise(),
+            "raw_mse": comparison.raw_mse(),
+            "mse_band": comparison.mse(self.reachable),
+            **{f"mse_{group}": comparison.mse(self.states.group == i) for i, group in enumerate(GROUPS)},
+            "success": comparison.monte_carlo.mean().item(),
+            "success_band": comparison.monte_carlo[self.reachable].mean().item(),
         }
         for p in LEVELS:
-            metrics[f"precision_p{100 * p:.0f}"] = one.precision(p)
-            metrics[f"recall_p{100 * p:.0f}"] = one.recall(p)
+            metrics[f"precision_p{100 * p:.0f}"] = comparison.precision(p)
+            metrics[f"recall_p{100 * p:.0f}"] = comparison.recall(p)
         return metrics
 
 
 class Accuracy:
-    """V against the mean payoff of rollouts on the same states for every solution, under several simulators of its own.
+    """Compares V with the mean payoff of rollouts on fixed reference states, under several simulators of its own.
 
     Args:
-        states: gives the reference states.
-        rollouts: paths from each, at least 2.
-        simulators: dt, substeps and crossing of each, by the name that its metrics start with; default `SIMULATORS`.
-        seed: of the noise.
+        states: a callable that returns the reference states.
+        rollouts: number of paths from each state, at least 2.
+        simulators: dt (s), substeps and crossing of each simulator, by the name with which its metrics start; the
+            default is `SIMULATORS`.
+        seed: seed of the noise.
+
+    Raises:
+        ArgumentError: if there are fewer than two rollouts.
     """
 
     def __init__(
@@ -95,7 +99,7 @@ class Accuracy:
             f"{simulator.dt / simulator.substeps:g} s and the exit rule {simulator.crossing}; V is 1 in A and 0 in B.",
             "mae": f"The mean absolute value of the difference in {name}_mse.",
             "noise": f"The {name}_mse that a perfect V would have: the variance of the Monte Carlo means.",
-            "raw_mse": f"As {name}_mse, for the networks' own V.",
+            "raw_mse": f"As {name}_mse, for the V of the networks alone.",
             "mse_band": f"As {name}_mse, over the states from which the problem does not rule the target out.",
             **{
                 f"mse_{group}": f"As {name}_mse, over group {i + 1} of {len(GROUPS)} of the reference states, counted "
@@ -112,7 +116,7 @@ class Accuracy:
         return meanings
 
     def __call__(self, solution: Solution, simulator: Simulator) -> AccuracyEvidence:
-        """Measure a solution under the evaluator's own simulators; the one that is handed to it is not used."""
+        """Measure a solution under the evaluator's own simulators; the argument `simulator` is not used."""
         states, problem = self.states(), solution.problem
         tau, x = like(solution, states.tau, states.x)
         comparisons = {

@@ -1,4 +1,4 @@
-"""Does the value say what the policy does, over the whole box or where episodes start?"""
+"""Calibration: the value against Monte Carlo of its policy, over the whole box or where episodes start."""
 
 from __future__ import annotations
 
@@ -22,20 +22,28 @@ class CalibrationEvidence:
     comparison: RolloutComparison
 
     def metrics(self) -> dict[str, float]:
-        one = self.comparison
-        return {"calibration_mse": one.mse(), "calibration_mae": one.mae(), "calibration_noise": one.noise()}
+        comparison = self.comparison
+        return {
+            "calibration_mse": comparison.mse(),
+            "calibration_mae": comparison.mae(),
+            "calibration_noise": comparison.noise(),
+        }
 
 
 class Calibration:
-    """V against the mean payoff of rollouts, at states of a law of starts and tau uniform in (0, T]: the same points
-    and noise at every call.
+    """Compares V with the mean payoff of rollouts at random states, with tau uniform in (0, T].
+
+    Points and noise are the same at every call.
 
     Args:
-        points: states.
-        rollouts: paths from each, at least 2.
-        initial_states: the law of the states, whose steps to go are not used; default uniform in the box of states,
-            outside A and B.
-        seed: of points and noise.
+        points: number of states.
+        rollouts: number of paths from each state, at least 2.
+        initial_states: distribution of the states; its steps to go are not used. The default is uniform in the box of
+            states, outside A and B.
+        seed: seed of points and noise.
+
+    Raises:
+        ArgumentError: if there is no point, or fewer than two rollouts.
     """
 
     def __init__(
@@ -60,7 +68,7 @@ class Calibration:
     def __call__(self, solution: Solution, simulator: Simulator) -> CalibrationEvidence:
         problem, rng = solution.problem, points_rng(self.seed)
         _, x = self.initial_states.sample(problem, self.points, 1, rng, solution.dtype)
-        late = 1 - torch.rand(self.points, generator=rng, dtype=solution.dtype)
-        tau = problem.horizon * late.to(solution.device)
+        fraction = 1 - torch.rand(self.points, generator=rng, dtype=solution.dtype)
+        tau = problem.horizon * fraction.to(solution.device)
         x = x.to(solution.device)
         return CalibrationEvidence(RolloutComparison.measure(solution, simulator, tau, x, self.rollouts, self.seed))

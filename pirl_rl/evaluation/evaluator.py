@@ -1,7 +1,7 @@
-"""What an evaluator is, and what comes of it.
+"""The interfaces of evaluators and of the evidence that they return.
 
-An evaluator measures a `Solution`. It says what each of its metrics means, and returns evidence: data, from which
-metrics are computed here and figures are drawn in `pirl_rl.figures`.
+An evaluator measures a `Solution` and states what each of its metrics means. The evidence that it returns is data, from
+which metrics are computed here and figures are drawn in `pirl_rl.figures`.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from pirl_rl.solution import Solution
 
 
 class Evidence(Protocol):
-    """What was measured."""
+    """The data that an evaluator measured."""
 
     def metrics(self) -> dict[str, float]:
-        """The numbers that sum it up, by name."""
+        """The metrics that are computed from the data, by name."""
         ...
 
 
 class Evaluator(Protocol):
-    """Measures a solution without exploration noise; it keeps no state, so that every call repeats the one before."""
+    """Measures a solution without exploration noise; it keeps no state, so that equal calls give equal evidence."""
 
     def meanings(self, problem: ReachAvoidProblem) -> dict[str, str]:
-        """A sentence for each metric that the evaluator has for this problem."""
+        """The meaning of each metric that the evaluator has for this problem, in whole sentences, by metric."""
         ...
 
     def __call__(self, solution: Solution, simulator: Simulator) -> Evidence:
@@ -35,14 +35,14 @@ class Evaluator(Protocol):
 
         Args:
             solution: the value and the policy.
-            simulator: plays the paths, of the solution's own problem.
+            simulator: plays the paths; its problem is that of the solution.
         """
         ...
 
 
 @dataclass(frozen=True)
 class Metrics:
-    """Evidence that is nothing but its metrics."""
+    """Evidence that consists of metrics alone."""
 
     values: Mapping[str, float]
 
@@ -51,15 +51,15 @@ class Metrics:
 
 
 def evaluate(solution: Solution, simulator: Simulator, evaluators: Mapping[str, Evaluator]) -> dict[str, Evidence]:
-    """The evidence of every evaluator, by the evaluator's name, in their order."""
+    """Call every evaluator; returns the evidence by the evaluators' names, in their order."""
     return {name: evaluator(solution, simulator) for name, evaluator in evaluators.items()}
 
 
 def metrics_of(evidence: Mapping[str, Evidence]) -> dict[str, float]:
-    """The metrics of all evidence in one dictionary, in its order."""
-    return {name: value for one in evidence.values() for name, value in one.metrics().items()}
+    """The metrics of all evidence in one dictionary, in the order of the evidence."""
+    return {name: value for entry in evidence.values() for name, value in entry.metrics().items()}
 
 
 def meanings_of(evaluators: Mapping[str, Evaluator], problem: ReachAvoidProblem) -> dict[str, str]:
-    """What every metric of the evaluators means for a problem, one sentence or more each."""
+    """The meanings of all metrics that the evaluators have for a problem, by metric."""
     return {name: text for evaluator in evaluators.values() for name, text in evaluator.meanings(problem).items()}

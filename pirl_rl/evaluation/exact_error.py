@@ -1,4 +1,4 @@
-"""The error of the learned value where the exact one is known."""
+"""The error of the learned value, for problems whose exact value is known."""
 
 from __future__ import annotations
 
@@ -14,15 +14,18 @@ from pirl_rl.solution import Solution
 
 
 class ExactError:
-    """Learned against exact V on the paper's grid: tau in [0, T] x states, tau = 0 and all edges included.
+    """Compares V with the exact value on the paper's grid over tau in [0, T] and the box of states, edges included.
 
-    A problem of several dimensions has `tau_points * x_points` uniform points of the same box in its place. A problem
-    whose exact V is not known has no metrics.
+    For a problem of several dimensions, `tau_points * x_points` uniform random points replace the grid. A problem whose
+    exact value is not known has no metrics.
 
     Args:
-        tau_points: grid points in tau.
-        x_points: grid points in x.
-        seed: of the points in several dimensions.
+        tau_points: number of grid points in tau, at least 2.
+        x_points: number of grid points in x, at least 2.
+        seed: seed of the random points.
+
+    Raises:
+        ArgumentError: if an axis has fewer than two points.
     """
 
     def __init__(self, tau_points: int = 101, x_points: int = 201, seed: int = 0):
@@ -40,7 +43,7 @@ class ExactError:
                 "included"
             )
         return {
-            "value_mse": f"The mean square of the networks' own V minus the exact V, on {where}.",
+            "value_mse": f"The mean square of the V of the networks alone minus the exact V, on {where}.",
             "value_max_error": "The largest absolute error on the points of value_mse.",
             "masked_value_mse": "As value_mse, with V set to 1 in A and to 0 in B.",
         }

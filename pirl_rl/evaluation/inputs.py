@@ -1,4 +1,4 @@
-"""What evaluators give to networks and simulators: tensors of the right kind, and random generators with seeds."""
+"""Inputs of evaluators: tensors in the solution's dtype and on its device, and seeded random generators."""
 
 from __future__ import annotations
 
@@ -8,17 +8,21 @@ from torch import Tensor
 from pirl_rl.solution import Solution
 
 POINTS = 1_000_003
-"""Keeps the seeds of points apart from those of noise; of a larger number torch would see the lowest 32 bits only."""
+"""An offset that separates the seeds of points from those of noise. It is small, because torch uses the lowest 32 bits
+of a seed only."""
 
 
 def like(solution: Solution, *tensors: Tensor) -> tuple[Tensor, ...]:
-    """The tensors in a solution's dtype, on its device."""
+    """Convert tensors to the dtype and the device of a solution."""
     return tuple(tensor.to(solution.device, solution.dtype) for tensor in tensors)
 
 
 def points_rng(seed: int) -> torch.Generator:
-    """A random generator for points and starts, on the CPU, independent of the noise of the same seed: were both drawn
-    from one stream, a path's noise would follow from its start."""
+    """A random generator for points and starts, on the CPU.
+
+    It is independent of the noise of the same seed. If both came from one stream, a path's noise would be correlated
+    with its start.
+    """
     return torch.Generator().manual_seed(POINTS + seed)
 
 

@@ -1,7 +1,7 @@
-"""Monte Carlo estimates of a policy's value, by simulation of the problem's own SDE.
+"""Monte Carlo estimates of a policy's value, by simulation of the problem's SDE, Eq. (sde).
 
-The value of a policy pi at (tau, x) is E[l_eps(X at the exit, or at the end)], a mean of payoffs in [0, 1]: with the
-hard payoff the probability to reach A before B within tau, in an invariance problem that to stay out of B.
+The value of a policy at (tau, x) is the expected payoff l_eps in [0, 1] at the path's exit, or at its end. For the
+indicator it is the probability to reach A before B within tau or, in an invariance problem, to stay out of B.
 """
 
 from __future__ import annotations
@@ -22,14 +22,15 @@ Policy = Callable[[Tensor, Tensor], Tensor]
 Array = TypeVar("Array", float, np.ndarray, Tensor)
 
 CHUNK = 32_768
-"""Paths simulated at once: bounds the memory, and keeps a step in a core's cache."""
+"""Number of paths that are simulated at once. It bounds the memory, and a step fits into the cache of a core."""
 
 STEP_TOLERANCE = 1e-4
-"""tau may exceed whole steps by this part of one without a further step: rounding of tau in float32."""
+"""The fraction of a step by which tau may exceed whole steps without a further step, because float32 rounds tau."""
 
 
 class Estimate(NamedTuple):
-    """Means (N,) of `rollouts` payoffs and the ends (N,) of their intervals, in the kind of array that came in."""
+    """Means (N,) of `rollouts` payoffs and the ends (N,) of their confidence intervals, as tensors or arrays like the
+    states they belong to."""
 
     probability: Tensor | np.ndarray
     low: Tensor | np.ndarray
@@ -40,12 +41,18 @@ class Estimate(NamedTuple):
 def wilson_interval(successes: Array, trials: int, confidence: float = 0.95) -> tuple[Array, Array]:
     """The score interval {p : |p_hat - p| <= z sqrt(p (1 - p) / trials)} (Wilson 1927).
 
-    For payoffs between 0 and 1 it is conservative: p (1 - p) is the largest variance that a mean of p allows.
+    It is conservative for payoffs between 0 and 1, because p (1 - p) is the largest variance that a mean of p allows.
 
     Args:
-        successes: their number, or the sum of the payoffs, in [0, trials].
-        trials: at least 1.
-        confidence: in (0, 1).
+        successes: number of successes, or sum of the payoffs, in [0, trials].
+        trials: number of trials, at least 1.
+        confidence: confidence level in (0, 1).
+
+    Returns:
+        The lower and the upper end, of the type and shape of `successes`.
+
+    Raises:
+        ArgumentError: if there is no trial, or the confidence is not in (0, 1).
     """
     if trials < 1 or not 0 < confidence < 1:
         raise ArgumentError(
@@ -54,7 +61,8 @@ def wilson_interval(successes: Array, trials: int, confidence: float = 0.95) -> 
     z2 = NormalDist().inv_cdf((1 + confidence) / 2) ** 2 / trials
 
     def lower(p: Array) -> Array:
-        # The product of both ends is p^2 / (1 + z^2/n): exactly 0 at p = 0, where their difference would round.
+        # The ends have the product p^2 / (1 + z^2/n). Dividing it by the upper end gives exactly 0 at p = 0, where the
+        # textbook difference would leave a rounding error.
         return p**2 / (p + z2 / 2 + (z2 * (p * (1 - p) + z2 / 4)) ** 0.5)  # type: ignore[return-value]
 
     p = successes / trials
@@ -73,23 +81,25 @@ def monte_carlo(
     seed: int = 0,
     confidence: float = 0.95,
 ) -> Estimate:
-    """The probability that a policy succeeds from each of N states, with its interval.
+    """The probability that a policy succeeds from each of N states, with its confidence interval.
 
-    States inside A or B, with tau = 0, or known as unreachable have their exact value and an interval of length 0.
+    States inside A or B, with tau = 0, or from which the problem knows that the target is out of reach have their exact
+    value and an interval of length 0.
 
     Args:
-        policy: physical control, (N,), (N, n) -> (N, m), as tensors.
-        tau: time to go (N,) or one for all, s.
+        problem: the physics.
+        policy: maps tau (N,) and x (N, n) to the control (N, m) in SI units, all of them tensors.
+        tau: times to go (N,), or one number for all states, in s.
         x: states (N, n); arrays other than tensors are simulated in torch's default dtype.
-        rollouts: paths from each state.
-        dt: control step, s; a state's own step is tau / ceil(tau / dt), so that no time is lost.
-        substeps: integration steps in it.
-        crossing: how exits are watched, see `pirl_rl.simulator`.
-        seed: of the noise; torch's global random generator stays untouched.
-        confidence: of the Wilson interval.
+        rollouts: number of paths from each state.
+        dt: longest control step in s; the step of a state is tau / ceil(tau / dt), so that whole steps fill tau.
+        substeps: number of integration steps in a control step.
+        crossing: how exits within a step are detected, see `pirl_rl.simulator`.
+        seed: seed of the noise; torch's global random generator is not used.
+        confidence: confidence level of the Wilson interval.
 
     Raises:
-        ValueError: naming the argument, what was expected and what was got.
+        ArgumentError: with the argument, what was expected and what was got.
     """
     points = x if isinstance(x, Tensor) else torch.as_tensor(np.asarray(x), dtype=torch.get_default_dtype())
     if points.ndim != 2 or points.shape[-1] != problem.states.dim:
@@ -113,7 +123,7 @@ def monte_carlo(
 def mean_payoff(
     simulator: Simulator, policy: Policy, tau: Tensor, x: Tensor, rollouts: int, rng: torch.Generator
 ) -> Tensor:
-    """Mean payoff (N,), float64, of paths from (tau, x), (N,) and (N, n); arguments as of `monte_carlo`."""
+    """Mean payoff (N,), float64, of paths from tau (N,) and x (N, n); the arguments are those of `monte_carlo`."""
     known, value = _known(simulator.problem, tau, x)
     steps = torch.ceil(tau.double() / simulator.dt - STEP_TOLERANCE).clamp(min=1).long()
     total, unknown = torch.zeros_like(tau, dtype=torch.float64), (~known).nonzero().squeeze(-1)
@@ -125,14 +135,14 @@ def mean_payoff(
 
 
 def _known(problem: ReachAvoidProblem, tau: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-    """Where the value needs no simulation, (N,) bool, and the value (N,) there."""
+    """A mask (N,) of the points whose value needs no simulation, and their value (N,)."""
     on_boundary, reached = ~problem.interior(x) | (tau <= 0), problem.reached(x)
     value = exit_value(problem, Step(x, reached & ~problem.failed(x), problem.failed(x)))
     return on_boundary | problem.unreachable(x), value * on_boundary
 
 
 def _add_payoffs(total: Tensor, simulator: Simulator, policy: Policy, steps, h, x, owner: Tensor, rng) -> None:
-    """Simulate one path from each state x[owner] and add its payoff to total[owner]; only live paths are carried."""
+    """Simulate one path from each state x[owner] and add its payoff to total[owner]; paths that ended are dropped."""
     x, left, h = x[owner], steps[owner], h[owner]
     while len(owner):
         step = simulator.step(x, policy(left * h, x).to(x.dtype), rng, dt=h)

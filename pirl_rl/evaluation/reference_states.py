@@ -1,8 +1,8 @@
-"""States on which learned solutions are compared: near and far from where a reference policy goes.
+"""Reference states on which learned solutions are compared, near to and far from the paths of a reference policy.
 
-The paper's protocol. States visited by noise-free episodes are moved in a random direction of network coordinates, in
-which tau and x are scaled to [-1, 1]; the distance to the states visited says how far from the training data a critic
-has to extrapolate.
+This is the paper's protocol. States that episodes without exploration noise visit are moved in a random direction of
+network coordinates, in which tau and x are scaled to [-1, 1]. The distance to the visited states tells how far from the
+training data a critic has to extrapolate.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from pirl_rl.sets import Box
 from pirl_rl.simulator import Simulator
 
 GROUPS = ("closest", "near", "moderate", "far", "farthest")
-CHUNK = 64
-"""States whose distances to all visited ones are held at once."""
+DISTANCE_ROWS = 64
+"""Number of states whose distances to all visited states are in memory at once."""
 
 
 @dataclass(frozen=True)
 class ReferenceStates:
-    """N states outside A and B, tau > 0.
+    """N states outside A and B, each with a time to go > 0.
 
     Attributes:
-        tau: (N,), s.
-        x: (N, n), SI.
-        distance: (N,), mean to the nearest visited states, network coordinates.
-        group: (N,) int64, fifths by distance: index into `GROUPS`.
+        tau: times to go (N,) in s.
+        x: states (N, n) in SI units.
+        distance: mean distances (N,) to the nearest visited states, in network coordinates.
+        group: indices (N,) into `GROUPS`, int64; each group is a fifth of the states by distance.
     """
 
     tau: Tensor
@@ -56,28 +56,31 @@ class ReferenceStates:
         radius: float = 0.40,
         neighbours: int = 10,
     ) -> ReferenceStates:
-        """The protocol, from visited states.
+        """Apply the protocol to visited states.
 
         Args:
-            problem: says which states are terminal.
-            tau: visited times to go (M,).
-            x: visited states (M, n).
-            box: of (tau, x), n + 1 axes; its [-1, 1] coordinates are the network's.
-            rng: of choice, direction and length.
-            count: states before terminal ones are dropped.
-            radius: largest displacement.
-            neighbours: visited states in the mean distance, at most M.
+            problem: defines which states are terminal.
+            tau: visited times to go (M,) in s.
+            x: visited states (M, n) in SI units.
+            box: box of (tau, x) with n + 1 axes; scaled to [-1, 1], it gives the network coordinates.
+            rng: draws the choice of visited states, the directions and the lengths.
+            count: number of states before terminal ones are dropped.
+            radius: largest displacement in network coordinates.
+            neighbours: number of visited states in the mean distance, at most M.
+
+        Raises:
+            ArgumentError: if `neighbours` or the number of axes of `box` does not fit.
         """
         if not 1 <= neighbours <= len(x):
             raise ArgumentError(f"neighbours: expected 1 to {len(x)}, the number of visited states, got {neighbours}")
         new_tau, new_x = displaced(problem, tau, x, box, rng, count, radius)
         visited, new = box.normalize(_joined(tau, x)), box.normalize(_joined(new_tau, new_x))
-        distance = torch.cat([_mean_nearest(part, visited, neighbours) for part in new.split(CHUNK)])
+        distance = torch.cat([_mean_nearest(part, visited, neighbours) for part in new.split(DISTANCE_ROWS)])
         rank = distance.argsort().argsort()
         return cls(new_tau, new_x, distance, rank * len(GROUPS) // len(rank))
 
     def save(self, path: str | Path) -> None:
-        """Write what `load` reads, in single precision."""
+        """Write the states to a file for `load`, in single precision."""
         arrays = {name: tensor.cpu().numpy() for name, tensor in vars(self).items()}
         small = {name: array.astype(np.int8 if name == "group" else np.float32) for name, array in arrays.items()}
         with replacing(Path(path), binary=True) as file:
@@ -85,6 +88,7 @@ class ReferenceStates:
 
     @classmethod
     def load(cls, path: str | Path) -> ReferenceStates:
+        """Read the states from a file that `save` wrote."""
         with np.load(path, allow_pickle=False) as file:
             tau, x, distance, group = (torch.from_numpy(file[name]) for name in ("tau", "x", "distance", "group"))
         return cls(tau, x, distance, group.long())
@@ -93,11 +97,26 @@ class ReferenceStates:
 def displaced(
     problem: ReachAvoidProblem, tau: Tensor, x: Tensor, box: Box, rng: torch.Generator, count: int, radius: float
 ) -> tuple[Tensor, Tensor]:
-    """Up to `count` of the states (M,), (M, n), each moved in a random direction of the box's coordinates by a length
-    uniform in [0, radius] and clipped to the box; those in A or B or with tau = 0 are dropped."""
+    """Move states in random directions of the box's coordinates by lengths uniform in [0, radius], clipped to the box.
+
+    Args:
+        problem: defines which states are terminal.
+        tau: times to go (M,) in s.
+        x: states (M, n) in SI units.
+        box: box of (tau, x) with n + 1 axes.
+        rng: draws the choice of states, the directions and the lengths.
+        count: number of states that are moved.
+        radius: largest displacement in the coordinates in which the box is [-1, 1]^(n + 1).
+
+    Returns:
+        tau (N,) and x (N, n), N <= count: states in A or B or with tau = 0 are dropped.
+
+    Raises:
+        ArgumentError: if the box has another number of axes.
+    """
     if box.dim != x.shape[-1] + 1:
         raise ArgumentError(f"box: expected {x.shape[-1] + 1} axes, tau first, got {box.dim}")
-    # Without repetition as long as there are enough.
+    # Each state is chosen once before any is chosen again.
     order = [torch.randperm(len(x), generator=rng, device=x.device) for _ in range(-(-count // len(x)))]
     chosen = torch.cat(order)[:count]
     z = moved(box.normalize(_joined(tau[chosen], x[chosen])), radius, rng).clamp(-1, 1)
@@ -109,7 +128,7 @@ def displaced(
 def visited_by(
     simulator: Simulator, policy: Policy, starts: InitialStates, episodes: int, rng: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """tau (M,) and states (M, n) on the paths of a policy, from each start to the state before the end."""
+    """tau (M,) in s and states (M, n) on the paths of a policy, from each start to the last state before the end."""
     max_steps = round(simulator.problem.horizon / simulator.dt)
     steps, x = starts.sample(simulator.problem, episodes, max_steps, rng, torch.get_default_dtype())
     paths = closed_loop(simulator, policy, (steps * simulator.dt).to(x), x, rng)
@@ -122,7 +141,7 @@ def _joined(tau: Tensor, x: Tensor) -> Tensor:
 
 
 def _mean_nearest(points: Tensor, others: Tensor, count: int) -> Tensor:
-    """Mean distance (N,) of points (N, d) to the nearest `count` of others (M, d)."""
-    # The default for many points subtracts squares, which loses small distances in single precision.
+    """Mean distances (N,) of points (N, d) to the `count` nearest of the others (M, d)."""
+    # For many points torch's default mode subtracts squares, which loses small distances in single precision.
     distances = torch.cdist(points, others, compute_mode="donot_use_mm_for_euclid_dist")
     return distances.topk(count, largest=False).values.mean(-1)

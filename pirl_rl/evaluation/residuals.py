@@ -1,4 +1,4 @@
-"""How well the raw V satisfies its equations at held-out points: HJB, boundary and one-step consistency."""
+"""Residuals of the learned V at held-out points: HJB equation, boundary condition and one-step consistency."""
 
 from __future__ import annotations
 
@@ -20,22 +20,31 @@ from pirl_rl.solution import Solution
 
 
 class Residuals:
-    """Mean squares of the residuals under the noise-free policy, at the same points and noise at every call.
+    """Mean squares of the residuals of the networks' V under their policy, without exploration noise.
 
-    - hjb_loss: (L^pi V)^2 at Sobol points of (0, T] x states outside A and B. A wrong policy can satisfy it.
-    - hjb_sup_loss: (max_u L^u V)^2 at the same points, the HJB equation itself, Eq. (hjb_pde): exposes a reversed
-      policy. The maximum is over a grid of controls and the policy's own.
-    - value_slope: mean |grad V| at the same points, in the coordinates in which `problem.states` is [-1, 1]^n: a value
-      that has collapsed to a constant satisfies the equation too.
-    - boundary_loss: (V - l_eps)^2, half of the points at tau = 0, half on the faces of A and B.
-    - td_loss: (V(y) - r - (1 - d) V(y'))^2 of one control step from x uniform and whole steps to go. The noise of the
-      step leaves the variance of V(y'), about |sigma^T grad V|^2 dt, even to the exact value.
+    Points and noise are the same at every call.
+
+    - hjb_loss: (L^pi V)^2, Eq. (linear_pde), at Sobol points of (0, T] and the box of states outside A and B. The value
+      of a wrong policy satisfies this equation too.
+    - hjb_sup_loss: (max_u L^u V)^2, Eq. (hjb_pde), at the same points, which exposes a wrong policy. The maximum is
+      over a grid of controls and the policy's control.
+    - value_slope: the mean of |grad V| at the same points, in the coordinates in which the box of states is [-1, 1]^n.
+      It is 0 for a value that has collapsed to a constant, which satisfies both equations.
+    - boundary_loss: (V - l_eps)^2, Eq. (parabolic_boundary), half of the points at tau = 0, half on the faces of A
+      and B.
+    - td_loss: (V(y) - r - (1 - d) V(y'))^2 over one control step from uniform states. Even the exact value leaves the
+      variance of V(y') under the noise of the step, about |sigma^T grad V|^2 dt.
 
     Args:
-        points: of each of the samples.
-        states: gives reference states in place of the Sobol points, where most of the box is never visited.
-        controls_per_axis: grid of the maximum, vertices included: this to the power m evaluations.
-        seed: of points and noise.
+        points: number of points of each sample, at least 2.
+        states: a callable that returns reference states to use instead of the Sobol points, for problems in which most
+            of the box is never visited.
+        controls_per_axis: number of grid points of each control, bounds included, at least 2; the maximum takes this
+            number to the power m of evaluations.
+        seed: seed of points and noise.
+
+    Raises:
+        ArgumentError: if there are fewer than two points or two controls per axis.
     """
 
     def __init__(
@@ -55,12 +64,13 @@ class Residuals:
         points = f"{self.points:,} held-out"
         where = f"{points} Sobol points outside A and B" if self.states is None else "the reference states"
         return {
-            "hjb_loss": f"The mean of (L^pi V)^2 in 1/s^2, at {where}: the networks' own V under its own policy.",
+            "hjb_loss": f"The mean of (L^pi V)^2 in 1/s^2, at {where}, for the V of the networks alone under the "
+            "learned policy.",
             "hjb_sup_loss": "The mean of (max_u L^u V)^2 in 1/s^2, at the same points: the HJB equation itself.",
             "boundary_loss": f"The mean of (V - l_eps)^2 at {points} points, half at tau = 0, half on the faces of A "
-            "and B, for the networks' own V.",
+            "and B, for the V of the networks alone.",
             "td_loss": f"The mean of (V(y) - r - (1 - d) V(y'))^2 over {points} transitions of one control step, for "
-            "the networks' own V; it includes the variance of V(y').",
+            "the V of the networks alone; it includes the variance of V(y').",
             "value_slope": "The mean of |grad V| at the points of hjb_loss, in the coordinates in which the box of "
             "states is [-1, 1]^n.",
         }

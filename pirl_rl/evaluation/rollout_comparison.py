@@ -1,4 +1,4 @@
-"""V against the mean payoff of rollouts: does the value say what the policy does?"""
+"""The learned V against the mean payoff of rollouts of the learned policy."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from pirl_rl.solution import Solution
 
 @dataclass(frozen=True)
 class RolloutComparison:
-    """V at N points, and the mean payoff of paths that the same policy plays from there; tensors on the CPU.
+    """V at N points, and the mean payoff of paths of the learned policy from there; all tensors are on the CPU.
 
     Attributes:
-        tau: times to go (N,), s.
-        x: states (N, n), SI.
+        tau: times to go (N,) in s.
+        x: states (N, n) in SI units.
         value: V (N,), float64: 1 in A, 0 in B and where the problem knows that the target is out of reach.
-        raw_value: the networks' own V (N,), float64.
-        monte_carlo: the mean payoffs (N,), float64.
-        rollouts: paths from each point, at least 2.
+        raw_value: V of the networks alone (N,), float64, without these masks.
+        monte_carlo: mean payoffs (N,), float64.
+        rollouts: number of paths from each point, at least 2.
     """
 
     tau: Tensor
@@ -37,14 +37,15 @@ class RolloutComparison:
     def measure(
         cls, solution: Solution, simulator: Simulator, tau: Tensor, x: Tensor, rollouts: int, seed: int
     ) -> RolloutComparison:
-        """Play `rollouts` paths from each of the points (N,) and (N, n), which are on the solution's device.
+        """Play `rollouts` paths from each point.
 
         Args:
             solution: the value and the policy.
             simulator: plays the paths.
-            tau, x: the points, in the solution's dtype.
-            rollouts: paths from each, at least 2.
-            seed: of the noise.
+            tau: times to go (N,) in s, in the solution's dtype and on its device.
+            x: states (N, n) in SI units, likewise.
+            rollouts: number of paths from each point, at least 2.
+            seed: seed of the noise.
         """
         mean = mean_payoff(simulator, solution.policy, tau, x, rollouts, noise_rng(solution, seed)).cpu()
         value, raw = (function(tau, x).cpu().double() for function in (solution.value, solution.raw_value))
@@ -56,7 +57,7 @@ class RolloutComparison:
         return self.value - self.monte_carlo
 
     def mse(self, where: Tensor | None = None) -> float:
-        """The mean square of the error, over all points or those of `where`, (N,) bool; NaN where there are none."""
+        """The mean square of the error over all points, or over those of the mask `where` (N,); NaN without points."""
         square = self.error.square()
         return (square if where is None else square[where]).mean().item()
 
@@ -67,13 +68,13 @@ class RolloutComparison:
     def noise(self) -> float:
         """The mean square error that a perfect V would have: the variance of the Monte Carlo means.
 
-        For payoffs of 0 and 1 its estimate is unbiased, for others in [0, 1] it is an upper bound.
+        The estimate is unbiased for payoffs of 0 and 1, and an upper bound for others in [0, 1].
         """
         mean = self.monte_carlo
         return (mean * (1 - mean)).mean().item() / (self.rollouts - 1)
 
     def raw_mse(self) -> float:
-        """The mean square of the networks' own V minus Monte Carlo."""
+        """The mean square of `raw_value` minus Monte Carlo."""
         return (self.raw_value - self.monte_carlo).square().mean().item()
 
     def precision(self, p: float) -> float:
@@ -88,5 +89,5 @@ class RolloutComparison:
 
 
 def _share(part: Tensor, whole: Tensor) -> float:
-    """The share of `whole` that is `part`, both (N,) bool; 1 of an empty one, where nothing is wrong."""
+    """The share of the points of the mask `whole` (N,) that are in `part` (N,); 1 if `whole` is empty."""
     return (part.double().sum() / whole.sum() if whole.any() else torch.ones(())).item()

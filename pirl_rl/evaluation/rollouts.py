@@ -1,4 +1,4 @@
-"""Stochastic closed-loop paths from three starts, to be seen in all planes; they have no metrics."""
+"""Stochastic closed-loop paths from three starts, for a figure in all planes of the problem; they have no metrics."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
-LEVELS = (0.9, 0.5, 0.1)
-"""V at the starts: of paths that should succeed, that may, and that should not."""
+START_VALUES = (0.9, 0.5, 0.1)
+"""V at the starts, where paths should succeed almost always, half of the time, and hardly ever."""
 
 
 @dataclass(frozen=True)
 class RolloutsEvidence:
-    """Paths of the policy, and V on all planes into which they are projected.
+    """Paths of the policy, and V on all planes onto which they are projected.
 
     Attributes:
         sections: V on every plane; empty for a problem without planes.
-        paths: on the CPU, those from one start side by side, as many from each; None without planes.
+        paths: equally many paths from each start, ordered by start, on the CPU; None for a problem without planes.
         values: V at the starts.
     """
 
@@ -37,13 +37,16 @@ class RolloutsEvidence:
 
 
 class Rollouts:
-    """Paths over the whole horizon from the states of the first plane's grid, outside A and B, where V is nearest to
-    0.9, 0.5 and 0.1.
+    """Plays paths over the whole horizon from those grid points of the first plane, outside A and B, where V is nearest
+    to 0.9, 0.5 and 0.1.
 
     Args:
-        paths: from each start.
-        points: of the planes' grids along each axis.
-        seed: of the noise.
+        paths: number of paths from each start.
+        points: number of grid points of each plane along each axis, at least 2.
+        seed: seed of the noise.
+
+    Raises:
+        ArgumentError: if there is no path, or fewer than two points.
     """
 
     def __init__(self, paths: int = 8, points: int = 31, seed: int = 0):
@@ -61,7 +64,7 @@ class Rollouts:
             return RolloutsEvidence([], None, [])
         first = sections[0]
         value = torch.where(problem.interior(first.x).cpu(), first.value.flatten(), torch.inf)
-        starts = torch.stack([(value - level).abs().argmin() for level in LEVELS])
+        starts = torch.stack([(value - level).abs().argmin() for level in START_VALUES])
         index = starts.repeat_interleave(self.paths).to(first.x.device)
         tau, x = first.tau[index], first.x[index]
         paths = closed_loop(simulator, solution.policy, tau, x, noise_rng(solution, self.seed))

@@ -18,7 +18,15 @@ from pirl_rl.solution import Solution
 
 @dataclass(frozen=True)
 class Section:
-    """V (k, k) on a plane's grid at tau = T: [i, j] is at coordinate j of the first axis and i of the second."""
+    """V on the grid of k x k points of a plane, at tau = T.
+
+    Attributes:
+        plane: the plane.
+        axes: the coordinates (k,) of the grid along the first and along the second axis.
+        tau: times to go (k^2,) in s, all equal to the horizon.
+        x: states (k^2, n) in SI units, row by row of the grid.
+        value: V (k, k); entry [i, j] is at coordinate j of the first axis and i of the second.
+    """
 
     plane: Plane
     axes: tuple[Tensor, Tensor]
@@ -28,7 +36,7 @@ class Section:
 
     @classmethod
     def of(cls, solution: Solution, plane: Plane, points: int) -> Section:
-        """Args: points: along each axis; tau (k^2,) and x (k^2, n) are those of the grid, row by row."""
+        """Compute V of a solution on a plane with `points` grid points along each axis."""
         first, second = (torch.linspace(a, b, points) for a, b in zip(plane.box.low, plane.box.high, strict=True))
         grid = torch.stack(torch.meshgrid(first, second, indexing="xy"), -1).reshape(-1, 2)
         tau = torch.full((len(grid),), solution.problem.horizon)
@@ -39,7 +47,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Slice:
-    """Beside the section's V: mean payoff (k, k) of the policy, and its projected vector field (k, k, 2)."""
+    """Mean payoff (k, k) and projected vector field (k, k, 2) of the learned policy on a section."""
 
     section: Section
     monte_carlo: Tensor
@@ -53,7 +61,7 @@ class Slice:
 
 @dataclass(frozen=True)
 class SlicesEvidence:
-    """A `Slice` of each plane, by name."""
+    """The slices of all planes, by the planes' names."""
 
     slices: dict[str, Slice]
 
@@ -66,12 +74,15 @@ class SlicesEvidence:
 
 
 class Slices:
-    """V against rollouts on a grid of each of the problem's planes; a problem without planes has no metrics.
+    """Compares V with rollouts on a grid of each of the problem's planes; a problem without planes has no metrics.
 
     Args:
-        points: of the grid along each axis.
-        rollouts: paths from each point.
-        seed: of the noise.
+        points: number of grid points along each axis, at least 2.
+        rollouts: number of paths from each point.
+        seed: seed of the noise.
+
+    Raises:
+        ArgumentError: if there are fewer than two points, or no rollout.
     """
 
     def __init__(self, points: int = 31, rollouts: int = 64, seed: int = 0):
@@ -103,6 +114,6 @@ class Slices:
 
 
 def projected_field(solution: Solution, section: Section) -> Tensor:
-    """d/dt of the plane's coordinates (k^2, 2) along the closed loop without noise, 1/s times their units."""
+    """Time derivative (k^2, 2) of the plane's coordinates under the learned policy, without noise, per second."""
     velocity = solution.problem.drift(section.x, solution.policy(section.tau, section.x))
     return torch.func.jvp(section.plane.project, (section.x,), (velocity,))[1]  # type: ignore[return-value]

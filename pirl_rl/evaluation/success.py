@@ -1,4 +1,4 @@
-"""The probability that the learned policy succeeds from the initial law of the episodes."""
+"""The probability that the learned policy succeeds from the distribution of initial states."""
 
 from __future__ import annotations
 
@@ -20,13 +20,17 @@ from pirl_rl.solution import Solution
 
 
 class Success:
-    """Episodes of whole steps, as the environment plays them, without exploration noise; the same starts and noise at
-    every call.
+    """Plays episodes of whole control steps, like the environment, but without exploration noise.
+
+    Starts and noise are the same at every call.
 
     Args:
-        episodes: their number.
-        initial_states: the law of x and of the steps to go; default uniform, steps to go random.
-        seed: of starts and noise.
+        episodes: number of episodes.
+        initial_states: distribution of x and of the steps to go; the default is uniform in both.
+        seed: seed of starts and noise.
+
+    Raises:
+        ArgumentError: if there is no episode.
     """
 
     def __init__(self, episodes: int = 10_000, initial_states: InitialStates | None = None, seed: int = 0):
@@ -42,8 +46,8 @@ class Success:
             "success_low": "The lower end of the 95% Wilson interval of success_rate.",
             "success_high": "The upper end of the 95% Wilson interval of success_rate.",
             "reward": "The mean payoff of the same episodes, equal to success_rate for the hard payoff.",
-            "value_spread": "The standard deviation of the networks' own V, clamped to [0, 1], over the starts of the "
-            "same episodes: 0 where V is a constant.",
+            "value_spread": "The standard deviation of the V of the networks alone, clamped to [0, 1], over the starts "
+            "of the same episodes; it is 0 if V is constant.",
         }
         if _optimum_is_known(problem, *_one_point(problem)):
             meanings["optimal_reward"] = "The reward of the optimal control from the same starts, with the same seed."

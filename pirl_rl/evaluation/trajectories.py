@@ -1,4 +1,4 @@
-"""Closed-loop paths."""
+"""Simulated paths of the closed loop of a policy and a problem."""
 
 from __future__ import annotations
 
@@ -14,8 +14,15 @@ from pirl_rl.simulator import Simulator
 
 @dataclass(frozen=True)
 class Trajectories:
-    """Paths in K control steps: `tau` (K + 1, N) and `state` (K + 1, N, n), the latter held after a path's end; `steps`
-    (N,) until that end; `reached`, `failed` (N,) bool."""
+    """N paths of up to K control steps, as tensors or as numpy arrays.
+
+    Attributes:
+        tau: times to go (K + 1, N) in s.
+        state: states (K + 1, N, n) in SI units, constant after a path's end.
+        steps: number of steps (N,) until a path's end.
+        reached: whether a path ended in the target (N,).
+        failed: whether a path ended in the avoid set (N,).
+    """
 
     tau: Any
     state: Any
@@ -26,8 +33,15 @@ class Trajectories:
 
 @torch.no_grad()
 def closed_loop(simulator: Simulator, policy: Policy, tau: Tensor, x: Tensor, rng: torch.Generator) -> Trajectories:
-    """Simulate one path from each (tau, x), (N,) and (N, n), until it reaches A or B or its time, rounded to whole
-    control steps, is over."""
+    """Simulate one path from each start until it reaches A or B, or until its time is over.
+
+    Args:
+        simulator: plays the steps.
+        policy: maps tau (N,) and x (N, n) to the control (N, m) in SI units.
+        tau: times to go (N,) in s, rounded to whole control steps.
+        x: initial states (N, n) in SI units.
+        rng: draws the noise.
+    """
     problem, left = simulator.problem, torch.round(tau.double() / simulator.dt).long()
     reached, failed, steps = problem.reached(x), problem.failed(x), torch.zeros_like(left)
     times, states = [tau], [x]

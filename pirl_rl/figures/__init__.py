@@ -1,4 +1,7 @@
-"""All drawing: evidence, runs, comparisons of runs, sweeps and the outer loop's tree; data in, figures out."""
+"""All figures: of evidence, runs, comparisons of runs, sweeps and the tree of an outer loop.
+
+The functions here draw data and return matplotlib figures; `save_figures` writes them.
+"""
 
 from pirl_rl.figures.accuracy import draw_accuracy
 from pirl_rl.figures.evidence import draw, draw_all

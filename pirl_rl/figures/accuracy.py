@@ -1,4 +1,4 @@
-"""How accuracy on reference states is drawn."""
+"""The figure of the accuracy on reference states."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from pirl_rl.evaluation.reference_states import GROUPS
 from pirl_rl.figures.evidence import draw
 
 BINS = 10
-"""Of V, in the reliability diagram."""
+"""Number of bins of V in the reliability diagram."""
 
 
 @draw.register
 def draw_accuracy(evidence: AccuracyEvidence) -> dict[str, Figure]:
-    """Reliability diagram of the states that can reach the target, and mean square error by distance."""
+    """A reliability diagram of the states that can reach the target, and the mean square error by distance."""
     figure = Figure(figsize=(11, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2)
     _draw_reliability(left, evidence)
@@ -51,6 +51,6 @@ def _draw_reliability(axes: Axes, evidence: AccuracyEvidence) -> None:
         axes.errorbar(means(value), height, error, fmt="o-", color=f"C{k}", capsize=2, label=f"{name} simulator")
     for i, count in enumerate(counts):
         axes.text((i + 0.5) / BINS, -0.05, f"{count}", ha="center", va="center", fontsize="small", color="0.4")
-    axes.set(title=f"{len(value)} states that can reach the target; grey: in the bin", xlabel="learned V")
+    axes.set(title=f"{len(value)} states that can reach the target; grey: states in the bin", xlabel="learned V")
     axes.set(ylabel="Monte Carlo, mean and standard error", xlim=(0, 1), ylim=(-0.1, 1.02))
     axes.legend(fontsize="small", loc="upper left")

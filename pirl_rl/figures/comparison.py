@@ -1,4 +1,4 @@
-"""Finished runs side by side, in groups."""
+"""The figure that compares groups of finished runs."""
 
 from __future__ import annotations
 
@@ -12,25 +12,24 @@ from matplotlib.figure import Figure
 
 from pirl_rl.figures.scales import log_scale
 
-ERRORS = {"value_mse": "MSE against the exact V", "fine_mse_band": "MSE against Monte Carlo, target within reach"}
-"""What stands for the error of V in the figure: the first that a run has."""
+ERROR_METRICS = {"value_mse": "MSE against the exact V", "fine_mse_band": "MSE against Monte Carlo, target in reach"}
+"""Metrics for the error of V with their labels, in the order of preference: the first that any run has is drawn."""
 
 SHARE = "reward / optimal reward, where known"
 
 
 class Curves(Protocol):
-    """What is drawn of a run.
+    """The data of a run that are drawn.
 
     Attributes:
-        metrics: the columns (rows,) of its metrics.csv.
+        metrics: the columns (rows,) of metrics.csv, by name.
     """
 
     @property
     def metrics(self) -> Mapping[str, np.ndarray]: ...
 
     def get(self, name: str) -> float:
-        """A number of its summary, NaN where there is none; "reward_share" is the reward as a fraction of the optimal
-        one."""
+        """An entry of the summary, or NaN if it has none; "reward_share" is the reward over the optimal reward."""
         ...
 
 
@@ -45,8 +44,8 @@ def draw_comparison(groups: Groups) -> Figure:
     reward, mse, both = (figure.add_subplot(grid[0, 4 * i : 4 * i + 4]) for i in range(3))
     _per_seed(reward, groups, "reward_share", "Reward of each seed", SHARE)
     runs = [run for group in groups.values() for run in group]
-    name = next((name for name in ERRORS if any(math.isfinite(run.get(name)) for run in runs)), "value_mse")
-    _per_seed(mse, groups, name, "MSE of V of each seed", ERRORS[name])
+    name = next((name for name in ERROR_METRICS if any(math.isfinite(run.get(name)) for run in runs)), "value_mse")
+    _per_seed(mse, groups, name, "MSE of V of each seed", ERROR_METRICS[name])
     errors = [run.get(name) for run in runs]
     log_scale(mse, "y", errors)
     log_scale(both, "x", errors)
@@ -65,8 +64,8 @@ def draw_comparison(groups: Groups) -> Figure:
 
 def _per_seed(axes: Axes, groups: Groups, name: str, title: str, ylabel: str) -> None:
     for i, (color, runs) in enumerate(_colored(groups)):
-        every = np.array([run.get(name) for run in runs], dtype=float)
-        values = every[np.isfinite(every)]
+        values = np.array([run.get(name) for run in runs], dtype=float)
+        values = values[np.isfinite(values)]
         if len(values):
             spread = np.linspace(-0.25, 0.25, len(values) + 2)[1:-1]
             axes.plot(i + spread, values, "o", ms=4, alpha=0.7, color=color)
@@ -81,25 +80,24 @@ def _reward_against_mse(axes: Axes, groups: Groups, error: str) -> None:
         pairs = np.array([(run.get(error), run.get("reward_share")) for run in runs])
         pairs = pairs[np.isfinite(pairs).all(-1)]
         axes.scatter(*pairs.T, s=14, alpha=0.6, color=color)
-        # The empty scatter of a group without exact values still gives the legend its entry.
+        # A group without such pairs gets an empty scatter, so that the legend has an entry for its colour.
         mean = pairs.mean(0, keepdims=True) if len(pairs) else pairs
         axes.scatter(*mean.T, s=130, color=color, edgecolors="black", label=label)
-    axes.set(title="Reward against MSE, large: mean", xlabel=ERRORS[error], ylabel=SHARE)
+    axes.set(title="Reward against MSE, large: mean", xlabel=ERROR_METRICS[error], ylabel=SHARE)
     axes.grid(alpha=0.3)
 
 
 def _evolution(axes: Axes, runs: Sequence[Curves], name: str, color: str) -> None:
-    """Median and range over runs at every update at which one of them was evaluated."""
-    at: dict[float, list[float]] = {}
+    """Draw the median and the range over the runs at every update at which one of them was evaluated."""
+    by_update: dict[float, list[float]] = {}
     for run in runs:
         for update, value in zip(run.metrics.get("update", ()), run.metrics.get(name, ()), strict=False):
             if math.isfinite(value):
-                at.setdefault(float(update), []).append(float(value))
-    updates = sorted(at)
-    axes.plot(updates, [np.median(at[update]) for update in updates], color=color)
-    axes.fill_between(
-        updates, [min(at[u]) for u in updates], [max(at[u]) for u in updates], color=color, alpha=0.2, lw=0
-    )
+                by_update.setdefault(float(update), []).append(float(value))
+    updates = sorted(by_update)
+    values = [by_update[update] for update in updates]
+    axes.plot(updates, [np.median(entries) for entries in values], color=color)
+    axes.fill_between(updates, list(map(min, values)), list(map(max, values)), color=color, alpha=0.2, lw=0)
 
 
 def _colored(groups: Groups) -> list[tuple[str, Sequence[Curves]]]:

@@ -1,4 +1,4 @@
-"""`draw`: the figures of any evidence."""
+"""`draw`, the function to which a class of evidence registers its figures."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from pirl_rl.evaluation import Evidence
 
 @singledispatch
 def draw(evidence: object) -> dict[str, Figure]:
-    """The figures of one piece of evidence, by name; none of a class that nobody has registered a function for.
+    """The figures of one evaluator's evidence, by name; none for a class without a registered function.
 
-    A module registers what draws its own evidence:
+    A module registers the function that draws its class of evidence:
 
         @draw.register
         def draw_mine(evidence: MyEvidence) -> dict[str, Figure]: ...
@@ -23,5 +23,5 @@ def draw(evidence: object) -> dict[str, Figure]:
 
 
 def draw_all(evidence: Mapping[str, Evidence]) -> dict[str, Figure]:
-    """The figures of all evidence in one dictionary, in its order."""
-    return {name: figure for one in evidence.values() for name, figure in draw(one).items()}
+    """The figures of all evidence in one dictionary, in the order of the evidence."""
+    return {name: figure for entry in evidence.values() for name, figure in draw(entry).items()}

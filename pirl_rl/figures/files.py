@@ -1,6 +1,6 @@
-"""Figures as files.
+"""Figures as PNG files.
 
-Figures are drawn without pyplot, so that no display and no global state is needed.
+Figures are drawn without pyplot, which would need a display and keep global state.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from pirl_rl.files import replacing
 
 DPI = 110
 FIGURES = "figures"
-"""Where a run directory keeps them."""
+"""The folder of a run directory that holds its figures."""
 
 
 def save_figures(figures: Mapping[str, Figure], folder: str | Path) -> list[Path]:
-    """Write figures as PNG files of their names; returns the files."""
+    """Write each figure to `<name>.png` in the folder; returns the paths."""
     paths = [Path(folder) / f"{name}.png" for name in figures]
     for path, figure in zip(paths, figures.values(), strict=True):
         with replacing(path, binary=True) as file:

@@ -1,4 +1,4 @@
-"""The value and the policy of a one-dimensional problem over (tau, x)."""
+"""Figures of the value and the policy of a one-dimensional problem over (tau, x)."""
 
 from __future__ import annotations
 
@@ -12,22 +12,31 @@ from matplotlib.figure import Figure
 
 from pirl_rl.solution import Solution
 
-ERRORS = (1e-4, 1.0)
-"""Colour scale of absolute errors, logarithmic: the corner would else hide all others."""
+ERROR_RANGE = (1e-4, 1.0)
+"""Ends of the logarithmic colour scale of absolute errors; on a linear one the corner at tau = 0 would hide the rest.
+"""
 
 
 class Grid(NamedTuple):
-    """A solution on tau x state, for one-dimensional problems; arrays (states, taus), `exact` where it is known."""
+    """A solution of a one-dimensional problem on a grid of tau and x.
+
+    Attributes:
+        tau: times to go (taus,) in s.
+        x: states (states,) in SI units.
+        value: V of the networks alone (states, taus).
+        exact: exact V (states, taus), or None if it is not known.
+        control: the policy (controls, states, taus) in SI units.
+    """
 
     tau: np.ndarray
     x: np.ndarray
     value: np.ndarray
     exact: np.ndarray | None
-    control: np.ndarray  # (controls, states, taus)
+    control: np.ndarray
 
 
-def solve_on_grid(solution: Solution, taus: int = 101, states: int = 201) -> Grid:
-    """The raw value and the policy on [0, T] x `problem.states`: the paper's error grid."""
+def evaluate_on_grid(solution: Solution, taus: int = 101, states: int = 201) -> Grid:
+    """Compute V of the networks alone and the policy on [0, T] x `problem.states`, the grid of the paper's error."""
     problem = solution.problem
     tau = torch.linspace(0, problem.horizon, taus, dtype=torch.float64)
     x = torch.linspace(problem.states.low[0], problem.states.high[0], states, dtype=torch.float64)
@@ -45,7 +54,7 @@ def solve_on_grid(solution: Solution, taus: int = 101, states: int = 201) -> Gri
 
 
 def draw_surface(grid: Grid) -> Figure:
-    """The learned V over (tau, x)."""
+    """A surface of the learned V over (tau, x)."""
     figure = Figure(figsize=(5.6, 4.8), layout="constrained")
     axes = figure.add_subplot(projection="3d")
     taus, states = np.meshgrid(grid.tau, grid.x)
@@ -59,7 +68,7 @@ def draw_surface(grid: Grid) -> Figure:
 
 
 def draw_value(grid: Grid) -> Figure:
-    """Heat maps of the learned V and, where it is known, of the exact V and of the error."""
+    """Heat maps of the learned V and, if the exact V is known, of the exact V and the error."""
     unit = Normalize(0, 1)
     maps: list[tuple[str, np.ndarray, Normalize, str]] = [("Learned V", grid.value, unit, "viridis")]
     if grid.exact is not None:
@@ -67,7 +76,7 @@ def draw_value(grid: Grid) -> Figure:
         mse = np.square(error).mean()
         maps += [
             ("Exact V", grid.exact, unit, "viridis"),
-            (f"|error|, MSE {mse:.1e}", error.clip(ERRORS[0]), LogNorm(*ERRORS), "magma"),
+            (f"|error|, MSE {mse:.1e}", error.clip(ERROR_RANGE[0]), LogNorm(*ERROR_RANGE), "magma"),
         ]
     figure = Figure(figsize=(0.6 + 4.2 * len(maps), 3.8), layout="constrained")
     for axes, (title, values, scale, colors) in zip(figure.subplots(1, len(maps), squeeze=False)[0], maps, strict=True):
@@ -76,7 +85,7 @@ def draw_value(grid: Grid) -> Figure:
 
 
 def draw_policy(grid: Grid, solution: Solution) -> Figure:
-    """Heat maps of the policy, one for each component of u, on the scale of its bounds."""
+    """Heat maps of the policy, one for each component of u, whose bounds are the ends of the colour scale."""
     controls = solution.problem.controls
     figure = Figure(figsize=(0.6 + 4.2 * controls.dim, 3.8), layout="constrained")
     for i, axes in enumerate(figure.subplots(1, controls.dim, squeeze=False)[0]):

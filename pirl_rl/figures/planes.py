@@ -1,4 +1,4 @@
-"""Values on a plane of the state space."""
+"""Heat maps on a plane of the state space."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ CONTOURS = (0.1, 0.5, 0.9)
 
 
 def draw_plane(axes: Axes, section: Section, values: Tensor) -> QuadMesh:
-    """Colours and contours of values (k, k) in [0, 1] on the section's grid; returns the mesh, for a colour bar."""
+    """Draw a heat map and contours of values (k, k) in [0, 1] on a section's grid; returns the heat map."""
     first, second = (axis.numpy() for axis in section.axes)
     mesh = axes.pcolormesh(first, second, values.numpy(), cmap="viridis", vmin=0, vmax=1, shading="nearest")
     lines = axes.contour(first, second, values.numpy(), CONTOURS, colors="white", linewidths=1)

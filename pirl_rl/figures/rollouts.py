@@ -1,4 +1,4 @@
-"""How closed-loop paths are drawn."""
+"""The figure of closed-loop paths."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from pirl_rl.figures.evidence import draw
 from pirl_rl.figures.planes import draw_plane
 
 BEYOND = "0.5"
-"""Where paths leave the box of a plane."""
+"""The colour of the part of a panel beyond the plane's box, where V is not drawn."""
 ENDS = {"reached": ("o", "limegreen"), "failed": ("X", "red"), "out of time": ("s", "white")}
 STARTS = ("white", "gold", "deepskyblue")
 
 
 @draw.register
 def draw_rollouts(evidence: RolloutsEvidence) -> dict[str, Figure]:
-    """Paths projected into every plane over the contours of V at the whole horizon, starts and ends marked."""
+    """Paths projected onto every plane, with marked starts and ends, over the contours of V at tau = T."""
     sections, paths, values = evidence.sections, evidence.paths, evidence.values
     if paths is None:
         return {}
@@ -33,10 +33,10 @@ def draw_rollouts(evidence: RolloutsEvidence) -> dict[str, Figure]:
         axes.set_facecolor(BEYOND)
         projected = section.plane.project(paths.state).numpy()
         for i, end in enumerate(ends):
-            line = projected[: paths.steps[i] + 1, i]
-            axes.plot(*line.T, color=STARTS[i // each], lw=0.8)
-            axes.plot(*line[0], "D", color=STARTS[i // each], mec="black", mew=0.6, ms=6, zorder=3)
-            axes.plot(*line[-1], ENDS[end][0], color=ENDS[end][1], mec="black", mew=0.6, ms=6, zorder=3)
+            path = projected[: paths.steps[i] + 1, i]
+            axes.plot(*path.T, color=STARTS[i // each], lw=0.8)
+            axes.plot(*path[0], "D", color=STARTS[i // each], mec="black", mew=0.6, ms=6, zorder=3)
+            axes.plot(*path[-1], ENDS[end][0], color=ENDS[end][1], mec="black", mew=0.6, ms=6, zorder=3)
         axes.autoscale()
     figure.colorbar(mesh, ax=list(all_axes), label=f"learned V, τ = {sections[0].tau[0]:g} s")
     starts = zip(STARTS, values, strict=True)

@@ -1,4 +1,4 @@
-"""How slices are drawn: V, Monte Carlo and the closed loop's directions on a plane."""
+"""Figures of slices: V, Monte Carlo and the directions of the closed loop on a plane."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from pirl_rl.figures.evidence import draw
 from pirl_rl.figures.planes import draw_plane
 
 ARROWS = 11
-"""Of the vector field, along each axis at most."""
+"""Largest number of arrows of the vector field along each axis."""
 
 
 @draw.register
 def draw_slices(evidence: SlicesEvidence) -> dict[str, Figure]:
-    """A figure for each plane."""
+    """One figure for each plane."""
     return {f"slice_{name}": draw_slice(cut) for name, cut in evidence.slices.items()}
 
 
 def draw_slice(cut: Slice) -> Figure:
-    """Learned V with the closed loop's directions, beside Monte Carlo."""
+    """The learned V with the directions of the closed loop, beside Monte Carlo."""
     section = cut.section
     titles = (f"Learned V, τ = {section.tau[0]:g} s", f"Monte Carlo of the policy, mean |difference| {cut.mae:.3f}")
     figure = Figure(figsize=(10.4, 4.4), layout="constrained")
@@ -37,13 +37,13 @@ def draw_slice(cut: Slice) -> Figure:
 
 
 def _draw_field(axes: Axes, section: Section, field: np.ndarray) -> None:
-    """Directions on paper: arrows of one length, in axes scaled by the box."""
+    """Draw the directions of the vector field as arrows of equal length, with both axes scaled by the box."""
     half = (np.array(section.plane.box.high) - np.array(section.plane.box.low)) / 2
     length = np.linalg.norm(field / half, axis=-1, keepdims=True)
     arrows = field / np.where(length > 0, length, 1)
     first, second = (axis.numpy() for axis in section.axes)
-    some = slice(None, None, -(-len(first) // ARROWS))
-    shown = arrows[some, some]
+    every = slice(None, None, -(-len(first) // ARROWS))
+    shown = arrows[every, every]
     style: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 0.6 * ARROWS, "pivot": "mid"}
     style |= {"width": 0.006, "color": "white", "edgecolor": "black", "linewidth": 0.6}
-    axes.quiver(first[some], second[some], shown[..., 0], shown[..., 1], **style)
+    axes.quiver(first[every], second[every], shown[..., 0], shown[..., 1], **style)

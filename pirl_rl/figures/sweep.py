@@ -1,4 +1,4 @@
-"""Figures of a metric over one setting or two."""
+"""Figures of a metric over one or two settings of a sweep."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from pirl_rl.figures.scales import spans_decades
 
 
 def draw_grid(metric: str, axes: Mapping[str, Sequence[str]], values: np.ndarray, texts: np.ndarray) -> Figure:
-    """A heat map with its numbers written in; cells without one are grey and say why.
+    """A heat map of a metric over two settings, with a text in every cell; cells without a value are grey.
 
     Args:
-        metric: what is shown.
-        axes: names and values of the two settings, that of the rows first.
-        values: (rows, columns), NaN where there is none.
-        texts: of the same shape.
+        metric: name of the metric.
+        axes: values of the two settings by their names, the setting of the rows first.
+        values: the metric (rows, columns), NaN in cells without a value.
+        texts: texts of the cells (rows, columns).
     """
     (row_name, rows), (column_name, columns) = axes.items()
     known = values[np.isfinite(values)]
@@ -40,17 +40,17 @@ def draw_grid(metric: str, axes: Mapping[str, Sequence[str]], values: np.ndarray
 
 
 def draw_line(metric: str, setting: str, runs: Mapping[str, Sequence[float]]) -> Figure:
-    """Every run and the mean, over the values of a setting; a value at which all runs failed has a cross.
+    """The metric of every run and its mean over the values of one setting, with a cross where all runs failed.
 
     Args:
-        metric: what is shown.
-        setting: its name.
-        runs: the metric of the runs at each value, NaN of those that failed.
+        metric: name of the metric.
+        setting: name of the setting.
+        runs: the metric of all runs by the value of the setting; NaN for a run that failed.
     """
     figure = Figure(figsize=(6, 4), layout="constrained")
     panel = figure.add_subplot()
     places, numeric = _places(list(runs))
-    ended = [np.array([value for value in of_one if not math.isnan(value)]) for of_one in runs.values()]
+    ended = [np.array([value for value in values if not math.isnan(value)]) for values in runs.values()]
     for place, values in zip(places, ended, strict=True):
         panel.plot([place] * len(values), values, "o", color="C0", ms=4, alpha=0.6)
         if not len(values):
@@ -69,7 +69,7 @@ def draw_line(metric: str, setting: str, runs: Mapping[str, Sequence[float]]) ->
 
 
 def _places(values: Sequence[str]) -> tuple[list[float], bool]:
-    """Where values stand on an axis: at themselves if all are numbers, else side by side."""
+    """The positions of a setting's values on an axis, and whether they are the values themselves, all being numbers."""
     try:
         return [float(value) for value in values], True
     except ValueError:

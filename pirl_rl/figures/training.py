@@ -1,4 +1,4 @@
-"""The course of training: losses and loss weights over updates."""
+"""The figure of a training: losses and loss weights over updates."""
 
 from __future__ import annotations
 
@@ -23,7 +23,11 @@ STYLES = {"TD": "C0-", "HJB": "C1-", "boundary": "C2--", "HJB, sup over u": "C3-
 
 
 def draw_training(metrics: Mapping[str, np.ndarray]) -> Figure:
-    """Training losses, held-out losses and loss weights over updates."""
+    """Training losses, held-out losses and loss weights over updates.
+
+    Args:
+        metrics: the columns (rows,) of metrics.csv, by name.
+    """
     figure = Figure(figsize=(7, 8), layout="constrained")
     top, middle, bottom = figure.subplots(3, 1, sharex=True)
     _curves(top, metrics, TRAINING, "Training losses, summed over critics")

@@ -1,4 +1,4 @@
-"""A tree of results in columns: the rounds of an outer loop, and what started from what."""
+"""The figure of an outer loop: a tree of results, with one column for each round."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from matplotlib.patches import Rectangle
 
 BEST = "#1b6e3c"
 WIDTH, HEIGHT, LANE = 0.8, 0.8, 0.3
-"""Of a node's box, and the height of a lane for edges that pass a column, in distances of columns and rows."""
+"""Width and height of a node's box, and height of a lane in which an edge passes a column. The units are the distances
+between columns and between rows."""
 
 Place = tuple[float, float]
 
@@ -21,10 +22,10 @@ class Node:
 
     Attributes:
         name: unique in the tree.
-        column: its column's index; the root's is 0.
-        origin: name of the node that it started from, in a column before; None for the root.
-        label: the text in its box, some lines.
-        color: of its box.
+        column: index of its column, 0 for the root.
+        origin: name of the node that it started from, in an earlier column; None for the root.
+        label: the text in its box, of one or several lines.
+        color: colour of its box.
         best: whether it is on the path to the best result.
     """
 
@@ -37,12 +38,12 @@ class Node:
 
 
 def draw_tree(nodes: Sequence[Node], columns: Sequence[str], title: str) -> Figure:
-    """One box for each node, edges from where it started; the best path is drawn bold.
+    """Draw a box for each node and an edge from its origin; the path to the best result is bold.
 
     Args:
-        nodes: the root first, each column's in the order in which they were made.
-        columns: the names of the columns.
-        title: of the figure.
+        nodes: the root, then the nodes of all columns in the order in which they were made.
+        columns: names of the columns.
+        title: title of the figure.
     """
     places = _places(nodes)
     rows = 2 * max(abs(y) for _, y in places.values()) + 1
@@ -67,9 +68,9 @@ def draw_tree(nodes: Sequence[Node], columns: Sequence[str], title: str) -> Figu
 
 
 def _places(nodes: Sequence[Node]) -> dict[tuple[str, int], Place]:
-    """Centres: (name, -1) of a node, (name, column) of the lane on which edges from that node pass a column.
+    """Centres (x, y) of nodes, by (name, -1), and of the lanes of edges that pass a column, by (origin, column).
 
-    A column is centred, and in the order of where its edges come from, so that few of them cross.
+    The entries of a column are sorted by the height at which their edges start, so that few edges cross.
     """
     root, *others = nodes
     places: dict[tuple[str, int], Place] = {(root.name, -1): (0.0, 0.0)}
@@ -98,7 +99,7 @@ def _origin(node: Node) -> str:
 
 
 def _edge(places: dict[tuple[str, int], Place], origin: str, name: str) -> list[Place]:
-    """From the right side of one node, along its lanes, to the left side of another."""
+    """The points of the edge from the right side of `origin`, along its lanes, to the left side of `name`."""
     (x0, y0), (x1, y1) = places[origin, -1], places[name, -1]
     lanes = [places[origin, column] for column in range(round(x0) + 1, round(x1))]
     passing = [(x + side * WIDTH / 2, y) for x, y in lanes for side in (-1, 1)]

@@ -1,1 +1,1 @@
-"""The outer loop: rounds of continuations, each planned by an advisor from the record of those before."""
+"""The outer loop: rounds of continued trainings, each planned by an advisor from the results of earlier rounds."""

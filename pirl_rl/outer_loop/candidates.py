@@ -1,4 +1,4 @@
-"""Candidates: their command lines, what has become of them, and what comes of them."""
+"""Candidates of an outer loop: their command lines, their failures and their results."""
 
 from __future__ import annotations
 
@@ -23,33 +23,35 @@ from pirl_rl.run_directory import RunDirectory
 from pirl_rl.schedules import LossSchedule
 
 FAILED = "failed.json"
-"""Beside a run's own files: the exit code and the last lines of a candidate that ended with an error."""
+"""The file in a run directory with the exit code and the last lines of a candidate that ended with an error."""
 
 JUDGED = ("reward", "calibration_mae")
 """Metrics that every result must have."""
 
 TIMES = ("updates", "wall_seconds", "updates_per_second")
-"""Entries of a summary that are no metrics: they differ when the same candidate is trained again."""
+"""Entries of a summary that are not metrics; the times differ when the same candidate is trained again."""
 
 STOPPED = (INTERRUPTED, *(-number for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)))
-"""Exit codes of a candidate that was asked to stop and can go on."""
+"""Exit codes of a candidate that was asked to stop and can be resumed."""
 
 LEADING = ("trainer.rollback=true",)
-"""Settings of a candidate's training that stand before the user's own, which may change them."""
+"""Settings of a candidate's training that precede the user's, so that the user can change them."""
 
 LAST_LINES = 20
+"""Number of lines of a failed candidate's log that are recorded."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """A candidate in its place.
+    """The training of a candidate.
 
     Attributes:
         name: "<round>/<candidate>".
-        folder: its run directory; the log lies beside it, as a new run directory must be empty.
+        folder: its run directory; the log lies beside it, because a new run directory must be empty.
         candidate: its entry in the plan.
-        start: the result from which it goes on; its run or checkpoint lies at `path`.
-        updates: length of its training.
+        start: the result from which it continues.
+        path: the run directory or the checkpoint of `start`.
+        updates: number of updates of its training.
     """
 
     name: str
@@ -77,14 +79,20 @@ class Task:
 
     @property
     def schedule(self) -> LossSchedule:
-        """Of the candidate's training. A plan counts in updates, and a schedule takes a center up to 1 for a share."""
-        one = self.candidate
-        unit = self.updates if one.schedule_center <= 1 else 1
-        center, steepness = one.schedule_center / unit, one.schedule_sharpness * unit
-        return LossSchedule(one.schedule_initial, one.schedule_final, center, steepness)
+        """The schedule of the loss weights, Eq. (weight_scheduling).
 
-    def moves(self) -> dict[str, tuple[float, float]]:
-        """Start and end of what moves along the schedule, by its key in `collocation`; none where that has no such."""
+        A plan counts in updates, but `LossSchedule` takes a center up to 1 as a share of the training.
+        """
+        plan = self.candidate
+        unit = self.updates if plan.schedule_center <= 1 else 1
+        center, steepness = plan.schedule_center / unit, plan.schedule_sharpness * unit
+        return LossSchedule(plan.schedule_initial, plan.schedule_final, center, steepness)
+
+    def collocation_ends(self) -> dict[str, tuple[float, float]]:
+        """Initial and final value of the collocation settings that follow the schedule, by their key in `collocation`.
+
+        It is empty if the collocation has no such settings.
+        """
         pairs = {}
         for key, name in (("jitter", "collocation_jitter"), ("replay_share", "collocation_replay_share")):
             before, after = getattr(self.start, name), getattr(self.candidate, name)
@@ -93,31 +101,37 @@ class Task:
         return pairs
 
 
-def overrides(task: Task, final: Sequence[str], seed: int) -> list[str]:
-    """The settings of a candidate's training that are not the user's."""
-    one = task.candidate
+def training_overrides(task: Task, final: Sequence[str], seed: int) -> list[str]:
+    """The overrides of a candidate's training that the loop adds to the user's.
+
+    Args:
+        task: the candidate.
+        final: names of the evaluators that judge it.
+        seed: seed of its training.
+    """
+    plan = task.candidate
     return [
         f"evaluation.final=[{','.join(final)}]",
         f"start={quoted(task.path)}",
         "schedule=sigmoid",
-        f"schedule.initial={_list(one.schedule_initial)}",
-        f"schedule.final={_list(one.schedule_final)}",
+        f"schedule.initial={_list(plan.schedule_initial)}",
+        f"schedule.final={_list(plan.schedule_final)}",
         f"schedule.center={task.schedule.center!r}",
         f"schedule.steepness={task.schedule.steepness!r}",
-        *(f"++collocation.{key}={_list(ends)}" for key, ends in task.moves().items()),
+        *(f"++collocation.{key}={_list(ends)}" for key, ends in task.collocation_ends().items()),
         "stages=[]",
         f"trainer.updates={task.updates}",
         f"seed={seed}",
     ]
 
 
-def job(task: Task, settings: Sequence[str], trust: Sequence[str]) -> Job:
-    """The command line that begins a candidate, or goes on with what there is of it; says so in the log.
+def make_job(task: Task, settings: Sequence[str], trust: Sequence[str]) -> Job:
+    """The command line that starts or resumes the training of a candidate; it is written to the log too.
 
     Args:
-        task: one that has not ended.
+        task: a candidate that has not ended.
         settings: all overrides of a new run.
-        trust: modules outside the package; one that goes on names them again.
+        trust: modules outside the package, which a resumed run has to name again.
     """
     train = [sys.executable, "-m", "pirl_rl.train"]
     if task.run.last.is_file():
@@ -132,7 +146,7 @@ def job(task: Task, settings: Sequence[str], trust: Sequence[str]) -> Job:
 
 
 def _clear(folder: Path) -> None:
-    """Remove a run that has no checkpoint to go on from."""
+    """Remove the directory of a run that has no checkpoint and cannot be resumed."""
     if folder.is_symlink():
         raise ConfigError(f"{folder}: expected a run directory, got a link")
     if folder.exists():
@@ -141,10 +155,14 @@ def _clear(folder: Path) -> None:
 
 
 def settle(task: Task, code: int) -> None:
-    """Take note of a process's end.
+    """Record the end of a candidate's process, and remove secrets from its log.
+
+    Args:
+        task: the candidate.
+        code: exit code of the process.
 
     Raises:
-        KeyboardInterrupt: somebody stopped it, which is nobody's failure.
+        KeyboardInterrupt: if the process was stopped, which does not count as a failure.
     """
     text = task.log.read_text(encoding="utf-8", errors="replace")
     if (clean := redact(text)) != text:
@@ -159,12 +177,12 @@ def settle(task: Task, code: int) -> None:
         json.dump({"exit_code": code, "log": lines[-LAST_LINES:]}, file, indent=2)
 
 
-def result(task: Task) -> Result:
-    """What became of a candidate that has ended."""
+def read_result(task: Task) -> Result:
+    """Read the result of a candidate that has ended from its run directory."""
     if not task.run.summary.is_file():
         failure = json.loads(task.failure.read_text(encoding="utf-8"))
-        last = failure["log"][-1] if failure["log"] else "no word"
-        # Later prompts quote it, and no path is to enter a prompt.
+        last = failure["log"][-1] if failure["log"] else "no output"
+        # Later prompts quote the reason, and paths of this machine do not belong into a prompt.
         reason = re.sub(r"\S*/\S*", "<path>", last)[:300]
         return _result(task, task.updates, status="failed", reason=f"exit code {failure['exit_code']}: {reason}")
     summary = json.loads(task.run.summary.read_text(encoding="utf-8"))
@@ -180,12 +198,12 @@ def result(task: Task) -> Result:
 
 
 def _result(task: Task, updates: int, checkpoint: str | None = None, **rest) -> Result:
-    """With what is in force at the last of its updates."""
-    weights, ends = task.start.weights, {key: before for key, (before, _) in task.moves().items()}
+    """A result with the loss weights and collocation settings in force at the last of `updates` updates."""
+    weights, ends = task.start.weights, {key: before for key, (before, _) in task.collocation_ends().items()}
     if updates > 0:
         progress = task.schedule.progress(updates - 1, task.updates)
         weights = task.schedule(updates - 1, task.updates)
-        ends = {key: before + (after - before) * progress for key, (before, after) in task.moves().items()}
+        ends = {key: before + (after - before) * progress for key, (before, after) in task.collocation_ends().items()}
     return Result(
         checkpoint=checkpoint,
         candidate=task.candidate,
@@ -198,9 +216,10 @@ def _result(task: Task, updates: int, checkpoint: str | None = None, **rest) -> 
 
 
 def quoted(text: Path | str) -> str:
-    """A path or text as a value of Hydra's command line, whatever characters it has."""
-    backslashes = re.sub(r"(\\+)(?='|\Z)", r"\1\1", str(text))  # elsewhere they stand for themselves
-    return "'" + backslashes.replace("'", "\\'") + "'"
+    """Quote a path or text with any characters as a value of Hydra's command line."""
+    # Hydra unescapes backslashes only before a quote.
+    doubled = re.sub(r"(\\+)(?='|\Z)", r"\1\1", str(text))
+    return "'" + doubled.replace("'", "\\'") + "'"
 
 
 def _list(values: Sequence[float]) -> str:

@@ -1,4 +1,4 @@
-"""The loop: ask for a plan, run its candidates, keep the results; goes on wherever its record stands."""
+"""The outer loop: ask for a plan, train its candidates, record the results. It continues from any state on record."""
 
 from __future__ import annotations
 
@@ -13,36 +13,36 @@ from pirl_rl.errors import ConfigError, PlanError
 from pirl_rl.outer_loop import prompt
 from pirl_rl.outer_loop.advisors import Advisor, Request
 from pirl_rl.outer_loop.advisors.greedy import Greedy
-from pirl_rl.outer_loop.candidates import LEADING, Task, job, overrides, result, settle
+from pirl_rl.outer_loop.candidates import LEADING, Task, make_job, read_result, settle, training_overrides
 from pirl_rl.outer_loop.history import History, Result, Round
 from pirl_rl.outer_loop.parsing import parse_plan
 from pirl_rl.outer_loop.plan import START, Plan
 from pirl_rl.outer_loop.processes import Job, Launcher
 from pirl_rl.outer_loop.record import Attempt, Record
 from pirl_rl.outer_loop.redaction import REMOVED, redact
-from pirl_rl.outer_loop.report import line, verdict
+from pirl_rl.outer_loop.report import describe_result, describe_round
 
 ASKED = 2
-"""Times that an advisor is asked before the fallback steps in."""
+"""Number of times that an advisor is asked before the fallback plans the round."""
 
 LONGEST_ANSWER, LONGEST_ERROR = 20_000, 2_000
-"""Characters of an answer and of an error that are recorded."""
+"""Largest numbers of characters of an answer and of an error that are recorded."""
 
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """What a loop is to do.
+    """Settings of an outer loop.
 
     Attributes:
         rounds: number of rounds up to the milestone.
         candidates: number of candidates in each round.
-        updates: length of each candidate's training.
-        extra_rounds: further rounds past the milestone, each only if the round before found a new best.
-        start: the checkpoint from which the loop goes on.
+        updates: number of updates of each candidate's training.
+        extra_rounds: largest number of rounds after the milestone, each only if the previous round found a new best.
+        start: the checkpoint from which the loop starts.
         train: the user's overrides of every candidate's training.
-        trust: modules outside the package that these name.
+        trust: modules outside the package that the overrides name.
         final: names of the evaluators that judge a candidate.
-        seed: of the training; each round adds its number.
+        seed: seed of the training, to which each round adds its number.
     """
 
     rounds: int
@@ -57,12 +57,12 @@ class LoopSettings:
 
 
 class Loop:
-    """Rounds of continuations.
+    """An outer loop of rounds, in each of which the candidates of a plan are trained.
 
     Args:
         settings: number of rounds and candidates, and how candidates are trained.
-        record: where everything is kept and found again.
-        advisor: plans; `Greedy` steps in for one that fails.
+        record: reads and writes the state of the loop.
+        advisor: plans the rounds; if it gives no plan, `Greedy` replaces it for that round.
         launcher: runs the candidates' command lines.
     """
 
@@ -70,11 +70,11 @@ class Loop:
         self.settings, self.record, self.advisor, self.launcher = settings, record, advisor, launcher
 
     def run(self, history: History) -> History:
-        """Add the rounds that are missing to a history."""
-        while self._goes_on(history):
+        """Run the rounds that a history lacks; returns the complete history."""
+        while self._unfinished(history):
             number = len(history.rounds) + 1
             plan = self._plan(number, history)
-            results = self._carry_out(number, plan, history)
+            results = self._train(number, plan, history)
             attempts = self.record.attempts(number)
             one = Round(
                 number=number,
@@ -85,10 +85,10 @@ class Loop:
             )
             self.record.write_round(one)
             history = history.model_copy(update={"rounds": [*history.rounds, one]})
-            print(verdict(history), flush=True)
+            print(describe_round(history), flush=True)
         return history
 
-    def _goes_on(self, history: History) -> bool:
+    def _unfinished(self, history: History) -> bool:
         done, settings = len(history.rounds), self.settings
         if done < settings.rounds:
             return True
@@ -96,7 +96,7 @@ class Loop:
         return done < settings.rounds + settings.extra_rounds and history.best != before.best
 
     def _plan(self, number: int, history: History) -> Plan:
-        """The round's plan, asked for unless it is there; every asking is on record before the next."""
+        """The round's plan, read from the record or asked for; every attempt is recorded before the next."""
         plan = self.record.plan(number)
         if plan is not None:
             try:
@@ -137,12 +137,12 @@ class Loop:
         return redact(text)
 
     def _ask(self, request: Request, before: Sequence[Attempt]) -> Attempt:
-        """Ask once more, the fallback once the advisor has had its turns."""
+        """Ask once: the advisor, or the fallback if the advisor has failed `ASKED` times."""
         fallback = len(before) >= ASKED
         advisor = Greedy() if fallback else self.advisor
         name, answer = type(advisor).__name__.lower(), ""
         try:
-            # What a program leaves behind may hold anything, so that none of it stays.
+            # An advisor's program may leave files of any content, so its folder is removed after the answer.
             with tempfile.TemporaryDirectory(prefix="advisor-") as folder:
                 errors = before[-1].errors if before and not fallback else ()
                 answer = advisor.propose(replace(request, folder=Path(folder), errors=errors))
@@ -152,8 +152,8 @@ class Loop:
             plan = parse_plan(answer, request.history, request.candidates)
             if redact(plan.model_dump()) != plan.model_dump(mode="json"):
                 answer = REMOVED
-                raise PlanError(["answer: it spells out the value of a secret environment variable"])
-        except Exception as error:  # whatever an advisor does, the loop goes on
+                raise PlanError(["answer: it holds the value of a secret environment variable"])
+        except Exception as error:  # no error of an advisor may end the loop
             if fallback:
                 raise
             reasons = error.errors if isinstance(error, PlanError) else [f"{type(error).__name__}: {error}"]
@@ -163,8 +163,8 @@ class Loop:
         text = answer if len(answer) <= LONGEST_ANSWER else plan.model_dump_json()
         return Attempt(advisor=name, answer=text)
 
-    def _carry_out(self, number: int, plan: Plan, history: History) -> list[Result]:
-        """Run the candidates that have not ended; the results of all, in the plan's order."""
+    def _train(self, number: int, plan: Plan, history: History) -> list[Result]:
+        """Train the candidates that have not ended; returns the results of all, in the plan's order."""
         settings = self.settings
         tasks = {}
         for candidate in plan.candidates:
@@ -177,14 +177,14 @@ class Loop:
 
         def ended(done: Job, code: int) -> None:
             settle(tasks[done.name], code)
-            print(line(result(tasks[done.name]), history), flush=True)
+            print(describe_result(read_result(tasks[done.name]), history), flush=True)
 
         jobs = []
         for task in tasks.values():
             if task.ended:
                 continue
-            own = overrides(task, settings.final, settings.seed + number)
-            jobs.append(job(task, [*LEADING, *settings.train, *own], settings.trust))
+            own = training_overrides(task, settings.final, settings.seed + number)
+            jobs.append(make_job(task, [*LEADING, *settings.train, *own], settings.trust))
             print(f"{task.name}: log in {task.log}", flush=True)
         self.launcher.run(jobs, ended)
-        return [result(task) for task in tasks.values()]
+        return [read_result(task) for task in tasks.values()]

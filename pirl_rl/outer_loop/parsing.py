@@ -1,7 +1,7 @@
-"""From an advisor's answer to a plan.
+"""The check that turns an advisor's answer into a plan.
 
-An answer is text from outside. It becomes a `Plan` only through `parse_plan`; nothing else of it is ever used. Its
-names are directory names, its checkpoints are looked up among those on offer and never read as paths.
+An answer is text from outside, and only the `Plan` that `parse_plan` reads from it is used. The names in it can serve
+as directory names; its checkpoints are looked up in the history and never read as paths.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from pirl_rl.outer_loop.history import History
 from pirl_rl.outer_loop.plan import START, Plan
 
 MAX_ANSWER = 200_000
-"""Characters of the longest answer that is read."""
+"""Largest number of characters of an answer."""
 
 
 def parse_plan(answer: str, history: History, count: int) -> Plan:
     """The plan in an answer: a JSON object, alone or in one fenced block.
 
     Args:
-        answer: any text.
-        history: what the plan may start from and must not repeat.
-        count: candidates that were asked for.
+        answer: the text of the advisor.
+        history: the checkpoints from which the plan may start, and the candidates that it must not repeat.
+        count: the number of candidates that the plan must have.
 
     Raises:
-        PlanError: with every reason.
+        PlanError: with all reasons for which the answer is no valid plan.
     """
     if len(answer) > MAX_ANSWER:
         raise PlanError([f"answer: expected at most {MAX_ANSWER:,} characters, got {len(answer):,}"])
@@ -36,23 +36,24 @@ def parse_plan(answer: str, history: History, count: int) -> Plan:
     try:
         plan = Plan.model_validate(json.loads(fenced[1] if fenced else answer))
     except ValidationError as error:
-        raise PlanError([_told(detail) for detail in error.errors()[:20]]) from None
-    except (ValueError, RecursionError) as error:  # also an integer of too many digits
-        raise PlanError([f"answer: expected one JSON object, got no JSON: {error}"]) from None
+        raise PlanError([_describe_error(detail) for detail in error.errors()[:20]]) from None
+    except (ValueError, RecursionError) as error:  # Python raises a ValueError for an integer of too many digits too
+        raise PlanError([f"answer: expected one JSON object, got text that is no JSON: {error}"]) from None
     errors = [*_count_errors(plan, count), *_start_errors(plan, history), *_repeat_errors(plan, history)]
     if errors:
         raise PlanError(errors)
     return plan
 
 
-def _told(detail) -> str:
+def _describe_error(detail) -> str:
     place = ".".join(str(part) for part in detail["loc"]) or "answer"
     return f"{place}: {detail['msg']}, got {repr(detail['input'])[:80]}"
 
 
 def _count_errors(plan: Plan, count: int) -> list[str]:
     names = [candidate.name for candidate in plan.candidates]
-    errors = [f"candidates: the name {name} stands twice" for name in sorted(set(names)) if names.count(name) > 1]
+    repeated = [name for name in sorted(set(names)) if names.count(name) > 1]
+    errors = [f"candidates: expected different names, got {name} more than once" for name in repeated]
     if len(names) != count:
         errors.append(f"candidates: expected exactly {count}, got {len(names)}")
     return errors
@@ -74,12 +75,12 @@ def _start_errors(plan: Plan, history: History) -> list[str]:
                 errors.append(f"{candidate.name}.{name}: the run's collocation has no such setting, leave it out")
     restarts = [candidate.name for candidate in plan.candidates if candidate.start_checkpoint == START]
     if len(restarts) > 1 and any(history.keeps(result) for result in history.results):
-        errors.append(f"candidates: at most one may restart from {START!r} once others succeeded, got {restarts}")
+        errors.append(f"candidates: expected at most restart from {START!r}, as sound results exist, got {restarts}")
     return errors
 
 
 def _repeat_errors(plan: Plan, history: History) -> list[str]:
-    """A combination of start, weights and jitter is run again only where the note says why, by the candidate's name."""
+    """Candidates that repeat a combination of start, weights and jitter, unless the round's note names them."""
     before = {result.candidate.settings for result in history.results if result.candidate is not None}
     return [
         f"{candidate.name}: repeats an earlier combination of start, weights and jitter; change it, or say why in "

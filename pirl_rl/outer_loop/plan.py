@@ -1,4 +1,4 @@
-"""What an advisor answers: a round's candidates; the field names are those of the paper's appendix on scheduling."""
+"""Plans of an outer loop. The names of the fields are those of the paper's appendix on scheduling."""
 
 from __future__ import annotations
 
@@ -7,30 +7,31 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 START = "start"
-"""Names the checkpoint that the whole loop starts from; others are "<round>/<candidate>"."""
+"""The name of the checkpoint from which the loop starts; the names of others are "<round>/<candidate>"."""
 
 Weight = Annotated[float, Field(ge=0, le=1e3, allow_inf_nan=False)]
 Triple = tuple[Weight, Weight, Weight]
 
 
 class Frozen(BaseModel):
-    """Immutable, with no fields but its own and no infinite numbers."""
+    """An immutable model without unknown fields and without infinite numbers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Candidate(Frozen):
-    """One continuation.
+    """A continued training with a schedule of the loss weights, Eq. (weight_scheduling), and of the collocation.
 
     Attributes:
         name: letters a-z, digits, - and _; unique in its round.
-        start_checkpoint: the name of a checkpoint of the history, from which the candidate goes on.
-        schedule_initial, schedule_final: weights (TD, HJB, boundary) at both ends of the sigmoid.
-        schedule_center: the middle of the sigmoid, in updates of this candidate.
-        schedule_sharpness: the rate of the sigmoid, 1/update.
-        collocation_jitter: deviation of the steps around visited states at the schedule's end, see `ReplayCollocation`;
-            None keeps that of the start. It moves there from the start's value.
-        collocation_replay_share: share of collocation points near visited states at the schedule's end; likewise.
+        start_checkpoint: the name of a checkpoint of the history, from which the candidate continues.
+        schedule_initial: loss weights (TD, HJB, boundary) before the transition.
+        schedule_final: loss weights (TD, HJB, boundary) after the transition.
+        schedule_center: the center of the sigmoid, in updates of this candidate.
+        schedule_sharpness: the steepness of the sigmoid, in 1/update.
+        collocation_jitter: the jitter after the transition, see `ReplayCollocation`; None keeps that of the start.
+        collocation_replay_share: the share of collocation points near visited states after the transition; None keeps
+            that of the start.
     """
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
@@ -44,12 +45,12 @@ class Candidate(Frozen):
 
     @property
     def settings(self) -> tuple:
-        """What the paper's prompt calls a combination."""
+        """The combination of settings that no later candidate should repeat, as the paper's prompt defines it."""
         return (self.start_checkpoint, self.schedule_initial, self.schedule_final, self.collocation_jitter)
 
 
 class Plan(Frozen):
-    """A round's candidates and why."""
+    """The candidates of a round, with a note on the reasons."""
 
     round_note: Annotated[str, Field(max_length=4_000)]
     candidates: Annotated[list[Candidate], Field(min_length=1)]

@@ -1,4 +1,4 @@
-"""Runs command lines side by side, none of which outlives this process."""
+"""Processes that run command lines in parallel and end with this process."""
 
 from __future__ import annotations
 
@@ -17,15 +17,17 @@ from pathlib import Path
 from typing import Protocol
 
 POLL = 0.05
-"""Seconds between looks at the running ones."""
+"""Seconds between checks of the running processes."""
 
 PR_SET_PDEATHSIG = 1
+"""The option of prctl(2) by which a Linux process receives a signal when its parent ends."""
+
 _libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
 
 
 @dataclass(frozen=True)
 class Job:
-    """A command line and the file that its output goes to."""
+    """A command line and the file to which its output is appended."""
 
     name: str
     command: tuple[str, ...]
@@ -33,20 +35,23 @@ class Job:
 
 
 class Launcher(Protocol):
-    """Runs jobs and calls `ended` with each and its exit code as it ends."""
+    """Runs jobs."""
 
-    def run(self, jobs: Sequence[Job], ended: Callable[[Job, int], None]) -> None: ...
+    def run(self, jobs: Sequence[Job], ended: Callable[[Job, int], None]) -> None:
+        """Run all jobs, and call `ended` with a job and its exit code when it has ended."""
+        ...
 
 
 class Processes:
-    """Each job a process of its own, with this one's environment and working directory.
+    """Runs each job in a process with the environment and the working directory of this one.
 
-    They end with this process: on any exception here they get SIGINT and are waited for, and if this one is killed the
-    kernel kills them (on Linux; elsewhere they end by themselves). Ctrl-C in a terminal reaches this process alone.
+    The processes end with this one. On any exception here they get SIGINT, and this process waits for their end. If
+    this process is killed, the Linux kernel kills them; on other systems they run to their end. Ctrl-C in a terminal
+    reaches this process alone.
 
     Args:
-        parallel: most at a time.
-        inherited: file descriptors that they keep open.
+        parallel: largest number of processes at a time.
+        inherited: file descriptors that the processes keep open.
     """
 
     def __init__(self, parallel: int = 1, inherited: Sequence[int] = ()):
@@ -86,7 +91,7 @@ class Processes:
 
 @contextmanager
 def _noted() -> Iterator[list[int]]:
-    """SIGINT and SIGTERM are put on a list: an exception would be lost if it came in the middle of a fork."""
+    """Collect SIGINT and SIGTERM in a list, because an exception in the middle of a fork would be lost."""
     noted: list[int] = []
     heard = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) != signal.SIG_IGN]
     previous = {number: signal.signal(number, lambda number, frame: noted.append(number)) for number in heard}
@@ -98,9 +103,10 @@ def _noted() -> Iterator[list[int]]:
 
 
 def _stop(children: Sequence[subprocess.Popen], signals: Sequence[int]) -> None:
-    """Ask all to end, as Ctrl-C does, so that they keep what they have; another signal here kills them."""
+    """Ask all processes to stop, as Ctrl-C does, so that they save their state; another signal kills them."""
     if children:
-        print("\nstopping the candidates after their update; Ctrl-C again kills them", file=sys.stderr, flush=True)
+        message = "\nstopping the candidates after their current update; Ctrl-C again kills them"
+        print(message, file=sys.stderr, flush=True)
     for child in children:
         child.send_signal(signal.SIGINT)
     before = len(signals)
@@ -112,7 +118,8 @@ def _stop(children: Sequence[subprocess.Popen], signals: Sequence[int]) -> None:
 
 
 def _attach(parent: int) -> None:
-    """In a new process: die with the parent, and hear SIGINT even where that ignores it, as in the background."""
+    """Run in a new process: make it end with its parent and receive SIGINT even if the parent ignores that signal, as
+    processes in the background of a shell do."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if _libc is not None:
         _libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""The prompt: a template of `conf`, the user's context and the record so far, for advisors that read."""
+"""The prompt of a round, for advisors that read text: a template of `conf`, the user's context and the history."""
 
 from __future__ import annotations
 
@@ -26,18 +26,19 @@ def render(
     context: str = "",
     template: Path = TEMPLATE,
 ) -> str:
-    """What a round asks, in words.
+    """Render the prompt of the next round.
 
     Args:
-        history: baseline and finished rounds; goes in as JSON.
-        rounds: of the loop; with `updates` they are the milestone.
-        candidates: that the plan must have.
-        updates: length of each.
-        context: the user's own words, put in as they are.
-        template: its source, Jinja2.
+        history: the baseline and the finished rounds, which the prompt contains as JSON.
+        rounds: number of rounds of the loop; `rounds * updates` is the milestone.
+        candidates: number of candidates that the plan must have.
+        updates: number of updates of each candidate.
+        context: the user's text, which the prompt contains unchanged.
+        template: file of the Jinja2 template.
 
     Raises:
-        OSError, jinja2.TemplateError: a template that cannot be read or rendered.
+        OSError: if the template cannot be read.
+        jinja2.TemplateError: if the template cannot be rendered.
     """
     environment = SandboxedEnvironment(
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
@@ -57,14 +58,14 @@ def render(
     )
 
 
-def asked(request: Request) -> str:
-    """A request's prompt and, on the second time of asking, what was wrong with the answer before."""
+def request_text(request: Request) -> str:
+    """The prompt of a request and, if an earlier answer was refused, the reasons."""
     if not request.errors:
         return request.prompt
     errors = "\n".join(f"- {' '.join(error.split())}" for error in request.errors)
     return (
         f"{request.prompt}\n## Your last answer was refused\n\nIt was no valid plan, for these reasons:\n\n{errors}\n\n"
-        "Answer again with the whole plan, mended.\n"
+        "Answer again with the whole corrected plan.\n"
     )
 
 

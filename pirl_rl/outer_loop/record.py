@@ -1,4 +1,4 @@
-"""The record of a loop: its directory, which is all its state.
+"""The record of a loop: the files of its directory, which hold its whole state.
 
 out/ tune.yaml context.md baseline.json tree.png report.md
      rounds/NNN/ prompt.md answer.json plan.json results.json candidates/<name>/ candidates/<name>.log
@@ -19,14 +19,23 @@ from pirl_rl.outer_loop.history import History, Result, Round
 from pirl_rl.outer_loop.plan import Plan
 from pirl_rl.outer_loop.redaction import redact
 
-CONTEXT = "<!-- What the advisor should know: read again before every round. Comments like this one are left out. -->\n"
+CONTEXT = (
+    "<!-- Write here what the advisor should know. The file is read before every round; comments like this one are not "
+    "passed on. -->\n"
+)
 COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 
 T = TypeVar("T")
 
 
 class Attempt(BaseModel):
-    """One asking: who was asked, what came, and what was wrong with it; without errors it is the round's plan."""
+    """An attempt to get a plan.
+
+    Attributes:
+        advisor: name of the advisor that was asked.
+        answer: its answer.
+        errors: why the answer is no valid plan; empty if it is the round's plan.
+    """
 
     advisor: str
     answer: str
@@ -34,19 +43,27 @@ class Attempt(BaseModel):
 
 
 class Record:
-    """Reads and writes the files of a loop; each appears whole or not at all, and holds no secret."""
+    """Reads and writes the files of a loop.
+
+    Each file is written completely or not at all, without the values of secret environment variables.
+
+    Args:
+        out: directory of the loop.
+    """
 
     def __init__(self, out: Path):
         self.out = out
 
     def folder(self, number: int) -> Path:
+        """The directory of a round."""
         return self.out / "rounds" / f"{number:03d}"
 
     def candidates(self, number: int) -> Path:
+        """The directory with the runs of a round's candidates."""
         return self.folder(number) / "candidates"
 
     def run(self, checkpoint: str) -> Path:
-        """The run directory of a checkpoint "<round>/<candidate>", which stands among a history's."""
+        """The run directory of a checkpoint "<round>/<candidate>" of the history."""
         number, _, name = checkpoint.partition("/")
         return self.candidates(int(number)) / name
 
@@ -67,7 +84,7 @@ class Record:
         _write(self.folder(one.number) / "results.json", one.model_dump())
 
     def context(self) -> str:
-        """What the user has to say, as it stands now."""
+        """The user's text for the advisor, read from context.md, which is created if it does not exist."""
         path = self.out / "context.md"
         if not path.exists():
             with replacing(path) as file:
@@ -101,10 +118,10 @@ def _write(path: Path, data: Any) -> None:
 
 
 def _read(path: Path, kind: type[T]) -> T | None:
-    """What the file holds, None without one.
+    """Read a file as an object of a type; None if there is no file.
 
     Raises:
-        ConfigError: it was changed to something else.
+        ConfigError: if the file does not hold such an object.
     """
     if not path.exists():
         return None
@@ -114,5 +131,5 @@ def _read(path: Path, kind: type[T]) -> T | None:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
         raise ConfigError(
-            f"{path}: {place}: {first['msg']}; mend the file, or remove it to do its part again"
+            f"{path}: {place}: {first['msg']}; correct the file, or remove it to repeat its part of the loop"
         ) from None

@@ -1,4 +1,4 @@
-"""Nothing that is written down holds a secret of the environment."""
+"""Removal of the values of secret environment variables from text before it is written."""
 
 from __future__ import annotations
 
@@ -7,14 +7,16 @@ import os
 from typing import Any
 
 NAMES = ("KEY", "TOKEN", "SECRET", "PASSWORD")
+"""An environment variable is secret if its name contains one of these words."""
+
 SHORTEST = 8
-"""Characters of the shortest value that is taken for a secret; shorter ones are words of any text."""
+"""Smallest number of characters of a secret; shorter values may be ordinary words."""
 
 REMOVED = "[removed]"
 
 
 def redact(value: Any) -> Any:
-    """The same text, or lists and mappings of text, without the values of environment variables of such names."""
+    """Remove the values of secret environment variables from a text, or from all texts of nested lists and mappings."""
     if isinstance(value, str):
         for secret in _secrets():
             value = value.replace(secret, REMOVED)
@@ -27,7 +29,7 @@ def redact(value: Any) -> Any:
 
 
 def _secrets() -> list[str]:
-    """As they are and as JSON writes them; longest first, since one may be part of another."""
+    """The secret values and the forms in which JSON writes them, longest first, because one may contain another."""
     values = {
         value
         for name, value in os.environ.items()

@@ -1,4 +1,4 @@
-"""What came of a loop, in words: a line for each candidate, a Markdown table, and the files of a report."""
+"""Reports of an outer loop: a line for each candidate and each round, a Markdown table, and the files of a report."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from pirl_rl.figures.files import save_figures
 from pirl_rl.figures.tree import draw_tree
 from pirl_rl.files import replacing
 from pirl_rl.outer_loop.history import History, Result
-from pirl_rl.outer_loop.tree import best_path, drawable, node_name, results, status, weights
+from pirl_rl.outer_loop.tree import best_path, displayed_status, drawable, node_name, results_by_name, weights_text
 
 
-def line(result: Result, history: History) -> str:
-    """What came of a candidate, beside the baseline."""
+def describe_result(result: Result, history: History) -> str:
+    """A line with the status and the metrics of a candidate, and their differences from the baseline's."""
     assert result.candidate is not None
     if not result.metrics:
         return f"  {result.candidate.name}: {result.status}: {result.reason}"
@@ -23,29 +23,30 @@ def line(result: Result, history: History) -> str:
         for label, name in (("reward", "reward"), ("success", "success_rate"), ("calibration", "calibration_mae"))
         if name in result.metrics and name in base
     ]
-    return f"  {result.candidate.name}: {result.status}, weights {weights(result)}, {', '.join(figures)}"
+    return f"  {result.candidate.name}: {result.status}, weights {weights_text(result)}, {', '.join(figures)}"
 
 
-def verdict(history: History) -> str:
-    """Where a round leaves the loop."""
-    best, one = history.best, history.rounds[-1]
-    by = f"{one.advisor}, stepping in" if one.fallback else one.advisor
+def describe_round(history: History) -> str:
+    """A line with the best checkpoint after the last round."""
+    best, last = history.best, history.rounds[-1]
+    advisor = f"{last.advisor}, as fallback" if last.fallback else last.advisor
     return (
-        f"round {one.number} ({by}): best so far {best.checkpoint}, calibration "
+        f"round {last.number} ({advisor}): best so far {best.checkpoint}, calibration "
         f"{best.metrics['calibration_mae']:.4g}, baseline {history.baseline.metrics['calibration_mae']:.4g}"
     )
 
 
 def markdown(history: History) -> str:
-    """The table of all results, then what the rounds' notes say."""
+    """The report in Markdown: a table of all results, then the note of each round and what failed in it."""
     names = ("reward", "success_rate", "calibration_mae", "hjb_loss", "td_loss")
     header = ["candidate", "from", "status", "TD, HJB, BC", "jitter", "replay share", "updates", *names]
     best, rows = str(history.best.checkpoint), []
-    for name, result in results(history).items():
+    for name, result in results_by_name(history).items():
         origin = "" if result.candidate is None else result.candidate.start_checkpoint
-        cells = [f"**{name}**" if name == best else name, origin, status(result, history), weights(result)]
-        cells += [_number(value) for value in (result.collocation_jitter, result.collocation_replay_share)]
-        cells += [str(result.updates), *(_number(result.metrics.get(key)) for key in names)]
+        cells = [f"**{name}**" if name == best else name, origin, displayed_status(result, history)]
+        cells += [weights_text(result)]
+        cells += [_format(value) for value in (result.collocation_jitter, result.collocation_replay_share)]
+        cells += [str(result.updates), *(_format(result.metrics.get(key)) for key in names)]
         rows.append(cells)
     widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
     table = [header, ["-" * width for width in widths], *rows]
@@ -55,7 +56,7 @@ def markdown(history: History) -> str:
     for one in history.rounds:
         lines += [f"## Round {one.number}, {one.advisor}", "", f"> {_plain(one.note)}", ""]
         if one.fallback:
-            lines += [f"The advisor that was asked gave no plan: {_plain(one.fallback)}", ""]
+            lines += [f"The chosen advisor gave no plan: {_plain(one.fallback)}", ""]
         unsound = [result for result in one.results if result.reason]
         lines += [f"- {node_name(result, one.number)}: {_plain(result.reason)}" for result in unsound]
         lines += [""] if unsound else []
@@ -69,10 +70,10 @@ def write_report(history: History, out: Path) -> list[Path]:
     return [out / "report.md", *save_figures({"tree": draw_tree(*drawable(history))}, out)]
 
 
-def _number(value: float | None) -> str:
+def _format(value: float | None) -> str:
     return "" if value is None else f"{value:.4g}"
 
 
 def _plain(text: str) -> str:
-    """Outside text on one line, without any meaning in Markdown."""
+    """Put text from outside on one line and escape the characters that Markdown interprets."""
     return re.sub(r"([\\`*_{}\[\]<>#|!])", r"\\\1", " ".join(text.split()))

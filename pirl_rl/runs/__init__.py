@@ -1,1 +1,1 @@
-"""Finished runs: opened, compared, and sorted into sweeps."""
+"""Finished runs: opening one, comparing several, and tables of sweeps."""

@@ -1,4 +1,4 @@
-"""Compare finished runs: one table and one figure of all groups of experiment and method.
+"""Compare finished runs in one table and one figure, grouped by experiment and method.
 
 python -m pirl_rl.compare DIR [DIR ...] [--out FOLDER]
 """
@@ -35,19 +35,29 @@ COLUMNS = (
     ("fine_mse_band worst", "fine_mse_band", np.max),
     *((name, name, np.mean) for name in (*LOSSES, "value_slope", "updates", "wall_seconds")),
 )
-"""Column of the table, key of summary.json, statistic over the group's runs; columns that no run has are left out."""
+"""Title of a column, key of summary.json, and statistic over the runs of a group. Columns without any value are left
+out."""
 
 
 class RunRecord(NamedTuple):
-    """What a finished run left: its group, the numbers of its summary, and the columns of its metrics."""
+    """The data of a finished run.
+
+    Attributes:
+        label: its group, "experiment method".
+        summary: the entries of summary.json.
+        metrics: the columns (rows,) of metrics.csv, by name.
+    """
 
     label: str
     summary: dict[str, float]
     metrics: dict[str, np.ndarray]
 
     def get(self, name: str) -> float:
-        """A number of the summary, NaN where there is none; "reward_share" is the reward as a fraction of the optimal
-        policy's, and the reward itself where that is not known: groups may start and end episodes differently."""
+        """An entry of the summary, or NaN if it has none.
+
+        "reward_share" is the reward over the reward of the optimal policy, or the reward itself if that is not known.
+        It makes groups comparable whose episodes start from different states.
+        """
         if name == "reward_share":
             return self.get("reward") / float(self.summary.get("optimal_reward") or 1.0)
         value = self.summary.get(name)
@@ -55,10 +65,10 @@ class RunRecord(NamedTuple):
 
 
 def find_runs(folders: Sequence[str | Path]) -> dict[str, list[RunRecord]]:
-    """All runs below the folders by label, "experiment method", in the order of their paths.
+    """All runs below the folders, by label, in the order of their paths.
 
     Raises:
-        RunError: no run below a folder, or a run that cannot be read.
+        RunError: if there is no run below a folder, or a run cannot be read.
     """
     groups: dict[str, list[RunRecord]] = {}
     paths: dict[Path, None] = {}
@@ -78,10 +88,10 @@ def find_runs(folders: Sequence[str | Path]) -> dict[str, list[RunRecord]]:
 
 
 def read_run(path: Path) -> RunRecord:
-    """Open one run directory.
+    """Read the data of one run directory.
 
     Raises:
-        RunError: with the file and the reason.
+        RunError: if a file is missing or cannot be read.
     """
     run = RunDirectory(path)
     try:
@@ -97,7 +107,7 @@ def read_run(path: Path) -> RunRecord:
 
 
 def comparison_table(groups: dict[str, list[RunRecord]]) -> str:
-    """A Markdown table, a row for each group; a dash where no run of the group has the number."""
+    """A Markdown table with a row for each group, and a dash where no run of a group has a finite value."""
     runs = [run for group in groups.values() for run in group]
     columns = [column for column in COLUMNS if any(math.isfinite(run.get(column[1])) for run in runs)]
     header = ["group", "seeds", *(title for title, _, _ in columns)]
@@ -106,7 +116,7 @@ def comparison_table(groups: dict[str, list[RunRecord]]) -> str:
         cells = []
         for _, name, statistic in columns:
             values = _finite([run.get(name) for run in runs])
-            cells.append(number(name, float(statistic(values))) if len(values) else "-")
+            cells.append(format_metric(name, float(statistic(values))) if len(values) else "-")
         lines.append([label, str(len(runs)), *cells])
     return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
 
@@ -116,8 +126,8 @@ def _finite(values: Sequence[float]) -> np.ndarray:
     return array[np.isfinite(array)]
 
 
-def number(name: str, value: float) -> str:
-    """A metric as text, with the digits that matter."""
+def format_metric(name: str, value: float) -> str:
+    """The value of a metric as text, with a number of digits that suits the metric."""
     if name in ("updates", "wall_seconds"):
         return f"{value:.0f}"
     return f"{value:.4f}" if name.startswith(("reward", "fine_success")) else f"{value:.2e}"
@@ -127,7 +137,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m pirl_rl.compare", description="Compare finished runs.")
     parser.add_argument("folders", nargs="+", metavar="DIR", help="run directories, or folders that hold them")
     parser.add_argument(
-        "--out", metavar="FOLDER", help="where comparison.md and comparison.png go; default the first DIR"
+        "--out", metavar="FOLDER", help="folder for comparison.md and comparison.png; default: the first DIR"
     )
     options = parser.parse_args(arguments)
     try:

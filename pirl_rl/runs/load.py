@@ -1,4 +1,4 @@
-"""A finished run, opened from its directory: the learned value, policy and reach-avoid sets."""
+"""Opening a run from its directory: the learned value, policy and reach-avoid sets."""
 
 from __future__ import annotations
 
@@ -25,22 +25,25 @@ from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
 ROUNDING = 1e-6
-"""tau may exceed the horizon by this part of it: rounding in single precision."""
+"""The fraction of the horizon by which tau may exceed it, because of rounding in single precision."""
 
 Crossing = Literal["bridge", "endpoint"]
 
 
 class Run:
-    """A trained solution. Numpy arrays in, numpy arrays out; torch tensors in, torch tensors out.
+    """A trained solution, for numpy arrays and torch tensors: results are of the kind of the argument x.
 
-    Methods take tau, a number or of a shape that broadcasts to (*), in s, 0 <= tau <= horizon, and finite states x
-    (*, n) in SI units; they raise `ArgumentError` for others.
+    Methods take finite states x (*, n) in SI units and times to go tau in s, a number or an array that broadcasts to
+    (*), with 0 <= tau <= horizon.
 
     Attributes:
-        solution: the networks, in torch.
+        solution: the problem and the networks, in torch.
         config: the run's configuration.
-        update: the number of updates after which the networks were saved.
-        simulator: the one that the run was trained on.
+        update: number of updates after which the networks were saved.
+        simulator: the simulator of the run's training environment.
+
+    Raises:
+        ArgumentError: from every method, for states or times to go of another shape or range.
     """
 
     def __init__(self, solution: Solution, config: DictConfig, update: int):
@@ -49,27 +52,27 @@ class Run:
 
     @property
     def problem(self) -> ReachAvoidProblem:
-        """The physics."""
+        """The problem that the run was trained on."""
         return self.solution.problem
 
     def value(self, tau, x):
-        """V(tau, x) (*), exactly 1 in A and 0 in B."""
+        """V(tau, x) (*) in [0, 1], which is exactly 1 in A and 0 in B."""
         return self._call(self.solution.value, tau, x)
 
     def gradient(self, tau, x):
-        """grad_x V (*, n), in 1 over the unit of each state, of the networks' own value, which knows no sets."""
+        """grad_x V (*, n) of the networks, without the masks of A and B, per unit of each state."""
         return self._call(self.solution.gradient, tau, x)
 
     def residual(self, tau, x):
-        """L^pi V (*), 1/s: what the HJB equation leaves under the learned policy, by the networks' own value."""
+        """The HJB residual L^pi V (*) in 1/s of the networks under the learned policy, Eq. (linear_pde)."""
         return self._call(self.solution.residual, tau, x)
 
     def policy(self, tau, x):
-        """The control (*, m) in SI units."""
+        """The learned control (*, m) in SI units."""
         return self._call(self.solution.policy, tau, x)
 
     def reach_avoid_set(self, p: float, tau: float) -> Callable:
-        """The set {x : V(tau, x) > p} as a function of states (*, n) to (*) bool, Eq. (ra_levelset)."""
+        """The set {x : V(tau, x) > p}, Eq. (ra_levelset), as a function that maps states (*, n) to (*) bool."""
         return lambda x: self.value(tau, x) > p
 
     def simulate(
@@ -81,13 +84,15 @@ class Run:
         crossing: Crossing | None = None,
         seed: int = 0,
     ) -> Trajectories:
-        """Closed-loop paths from the states over the time tau under the learned policy.
+        """Simulate one path from each state under the learned policy.
 
         Args:
-            tau: time to go, s.
-            x: states (N, n).
-            dt, substeps, crossing: of the simulator; default those that the run was trained on.
-            seed: of the noise.
+            tau: time to go in s, rounded to whole control steps.
+            x: initial states (N, n) in SI units.
+            dt: control step in s; the default of this and of the next two is that of the training.
+            substeps: number of integration steps in a control step.
+            crossing: how exits within a step are detected, see `pirl_rl.simulator`.
+            seed: seed of the noise.
         """
         times, state, answer = self._starts(tau, x)
         rng = torch.Generator(state.device).manual_seed(seed)
@@ -105,41 +110,44 @@ class Run:
         seed: int = 0,
         confidence: float = 0.95,
     ) -> Estimate:
-        """The probability that the learned policy succeeds from each state, with its interval.
+        """Estimate the probability that the learned policy succeeds from each state, with a confidence interval.
 
         Args:
-            tau: time to go, s.
-            x: states (N, n).
-            rollouts: paths from each state.
-            dt, substeps, crossing: of the simulator; default those that the run was trained on.
-            seed: of the noise.
-            confidence: of the Wilson interval.
+            tau: times to go in s, a number or (N,).
+            x: initial states (N, n) in SI units.
+            rollouts: number of paths from each state.
+            dt: longest control step in s; the default of this and of the next two is that of the training.
+            substeps: number of integration steps in a control step.
+            crossing: how exits within a step are detected, see `pirl_rl.simulator`.
+            seed: seed of the noise.
+            confidence: confidence level of the Wilson interval.
         """
         times, state, answer = self._starts(tau, x)
-        steps = _steps(self._simulator(dt, substeps, crossing))
-        policy = self.solution.policy
-        found = monte_carlo(self.problem, policy, times, state, rollouts, **steps, seed=seed, confidence=confidence)
-        ends = (answer(torch.as_tensor(entry)) for entry in (found.probability, found.low, found.high))
-        return Estimate(*ends, rollouts=found.rollouts)
+        settings = _settings_of(self._simulator(dt, substeps, crossing)) | {"seed": seed, "confidence": confidence}
+        estimate = monte_carlo(self.problem, self.solution.policy, times, state, rollouts, **settings)
+        entries = (estimate.probability, estimate.low, estimate.high)
+        return Estimate(*(answer(torch.as_tensor(entry)) for entry in entries), rollouts=estimate.rollouts)
 
     def _simulator(self, dt: float | None, substeps: int | None, crossing: Crossing | None) -> Simulator:
         given = {"dt": dt, "substeps": substeps, "crossing": crossing}
-        return Simulator(self.problem, **_steps(self.simulator) | {k: v for k, v in given.items() if v is not None})
+        return Simulator(
+            self.problem, **_settings_of(self.simulator) | {k: v for k, v in given.items() if v is not None}
+        )
 
     def _call(self, function: Callable[[Tensor, Tensor], Tensor], tau, x):
         times, state, answer = self._arguments(tau, x)
-        found = function(times.reshape(-1), state.reshape(-1, state.shape[-1]))
-        return answer(found.reshape(*times.shape, *found.shape[1:]))
+        result = function(times.reshape(-1), state.reshape(-1, state.shape[-1]))
+        return answer(result.reshape(*times.shape, *result.shape[1:]))
 
     def _starts(self, tau, x) -> tuple[Tensor, Tensor, Callable[[Tensor], Any]]:
-        """As `_arguments`, of paths, which start from a list of states."""
+        """The same as `_arguments` for the starts of paths, whose states have the shape (N, n)."""
         times, state, answer = self._arguments(tau, x)
         if state.ndim != 2:
             raise ArgumentError(f"x: expected states of shape (N, {state.shape[-1]}), got {tuple(state.shape)}")
         return times, state, answer
 
     def _arguments(self, tau, x) -> tuple[Tensor, Tensor, Callable[[Tensor], Any]]:
-        """Times (*) and states (*, n) as the networks take them, and what gives an answer in the caller's kind."""
+        """tau (*) and x (*, n) in the networks' dtype, and a function that converts results to the kind of x."""
         state = torch.as_tensor(x, dtype=self.solution.dtype, device=self.solution.device)
         dim, horizon = self.problem.states.dim, self.problem.horizon
         if state.ndim < 1 or state.shape[-1] != dim:
@@ -159,7 +167,7 @@ class Run:
         return times, state, lambda answer: np.asarray(answer.cpu())
 
 
-def _steps(simulator: Simulator) -> dict[str, Any]:
+def _settings_of(simulator: Simulator) -> dict[str, Any]:
     return {name: getattr(simulator, name) for name in ("dt", "substeps", "crossing")}
 
 
@@ -173,16 +181,16 @@ def load_run(
     """Open a run directory.
 
     Args:
-        folder: as training or `python -m pirl_rl.export` left it.
-        trust: modules outside pirl_rl that its configuration may name, e.g. that of your own problem.
-        weights: a file in `checkpoints/`; default the last.
-        device: where the networks go.
-        problem: the problem of a run whose configuration cannot name it, as it was trained on an object; it takes the
-            place of `env.problem`.
+        folder: a directory that training or `python -m pirl_rl.export` wrote.
+        trust: modules outside pirl_rl that its configuration may name, such as the module of your own problem.
+        weights: name of a file in `checkpoints/`; the default is the latest.
+        device: device of the networks.
+        problem: replaces `env.problem`, for a run that was trained on an object, which no configuration can name.
 
     Raises:
-        ConfigError: not a run directory, or a configuration that names code from elsewhere, or no problem.
-        CheckpointError: no checkpoint, a broken one, or one that does not fit the configuration.
+        ConfigError: if the folder is not a run directory, or its configuration names a class that is not trusted, or no
+            problem.
+        CheckpointError: if the checkpoint is missing, broken or does not fit the configuration.
     """
     run = RunDirectory(folder)
     config = load_config(folder)

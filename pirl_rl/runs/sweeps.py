@@ -1,4 +1,4 @@
-"""A sweep: table and figure of a metric over the settings of a multirun.
+"""The table and the figure of a metric over the settings of a sweep.
 
 python -m pirl_rl.sweeps DIR [--metric value_mse] [--axes KEY [KEY]] [--out FOLDER]
 """
@@ -22,15 +22,22 @@ from pirl_rl.errors import RunError
 from pirl_rl.figures.files import save_figures
 from pirl_rl.figures.sweep import draw_grid, draw_line
 from pirl_rl.run_directory import RunDirectory
-from pirl_rl.runs.compare import number, read_run
+from pirl_rl.runs.compare import format_metric, read_run
 
 AVERAGED = "seed"
+"""The setting over which the metric is averaged unless it is chosen as an axis."""
+
 UNSET = "default"
-"""Stands for the value of a setting in the runs in which it was not typed."""
+"""The value that is shown for a setting in runs whose command line did not have it."""
 
 
-class Job(NamedTuple):
-    """One run of a sweep: what was typed for it, and its summary.json, empty where it failed or has not ended."""
+class SweepJob(NamedTuple):
+    """One run of a sweep.
+
+    Attributes:
+        settings: the settings on its command line, by key.
+        summary: the entries of summary.json; empty if the run failed or has not ended.
+    """
 
     settings: dict[str, str]
     summary: dict[str, float]
@@ -41,9 +48,9 @@ class Sweep(NamedTuple):
 
     Attributes:
         metric: a key of summary.json.
-        axes: the settings' names with their values, sorted.
-        cells: the metric of all runs with the same values, NaN of those that failed; combinations without a run are
-            absent.
+        axes: the sorted values of each setting, by the setting's name.
+        cells: the metric of all runs with the same values of the settings, NaN for a run that failed; combinations
+            without a run are absent.
     """
 
     metric: str
@@ -51,25 +58,26 @@ class Sweep(NamedTuple):
     cells: dict[tuple[str, ...], list[float]]
 
     def mean(self, cell: tuple[str, ...]) -> float:
-        """Over the runs that ended; NaN without one."""
+        """The mean over the runs of a cell that ended, or NaN if none did."""
         ended = [value for value in self.cells.get(cell, []) if not math.isnan(value)]
         return float(np.mean(ended)) if ended else math.nan
 
     def text(self, cell: tuple[str, ...]) -> str:
+        """The mean of a cell as text, or why there is none."""
         if cell not in self.cells:
             return "missing"
         runs = self.cells[cell]
         failed = sum(map(math.isnan, runs))
         if failed == len(runs):
             return "failed"
-        return number(self.metric, self.mean(cell)) + (f" ({failed} of {len(runs)} failed)" if failed else "")
+        return format_metric(self.metric, self.mean(cell)) + (f" ({failed} of {len(runs)} failed)" if failed else "")
 
 
-def find_jobs(folder: Path) -> list[Job]:
-    """All runs below a multirun directory.
+def find_jobs(folder: Path) -> list[SweepJob]:
+    """All runs below the directory of a sweep.
 
     Raises:
-        RunError: there is none, or one that cannot be read.
+        RunError: if there is no run, or one cannot be read.
     """
     jobs = []
     for path in sorted(folder.rglob(str(RunDirectory.OVERRIDES))):
@@ -81,30 +89,30 @@ def find_jobs(folder: Path) -> list[Job]:
         if not isinstance(typed, list):
             raise RunError(f"{path}: expected a list of overrides, got {type(typed).__name__}")
         settings = {key.lstrip("+~"): _plain(value) for key, _, value in (str(item).partition("=") for item in typed)}
-        jobs.append(Job(settings, read_run(run.path).summary if run.summary.is_file() else {}))
+        jobs.append(SweepJob(settings, read_run(run.path).summary if run.summary.is_file() else {}))
     if not jobs:
         raise RunError(f"no runs found below {folder}: expected directories with {RunDirectory.OVERRIDES}")
     return jobs
 
 
 def _plain(value: str) -> str:
-    """One way to write a number: 1e4 and 10000.0 are the same setting."""
+    """Write equal numbers equally, so that 1e4 and 10000.0 are one value of a setting."""
     try:
         return f"{float(value):g}"
     except ValueError:
         return value
 
 
-def gather(jobs: Sequence[Job], metric: str, axes: Sequence[str] = ()) -> Sweep:
-    """Sort runs into the cells of a table; what varies beside the axes is averaged over.
+def gather(jobs: Sequence[SweepJob], metric: str, axes: Sequence[str] = ()) -> Sweep:
+    """Sort runs into the cells of a table; other settings that vary are averaged over.
 
     Args:
         jobs: the runs.
         metric: a key of summary.json.
-        axes: one or two settings; default those that vary, the seed excepted.
+        axes: one or two settings; the default is all settings that vary, except the seed.
 
     Raises:
-        RunError: nothing varies, more than two settings do, or no run has the metric.
+        RunError: if no run has the metric, a setting is unknown, or there are not one or two axes.
     """
     known = {name for job in jobs for name in job.summary}
     if metric not in known:
@@ -128,7 +136,7 @@ def gather(jobs: Sequence[Job], metric: str, axes: Sequence[str] = ()) -> Sweep:
 
 
 def _order(value: str) -> tuple[bool, float, str]:
-    """Numbers by size, then words."""
+    """The key by which values are sorted: numbers by size, then words."""
     try:
         return False, float(value), value
     except ValueError:
@@ -136,7 +144,7 @@ def _order(value: str) -> tuple[bool, float, str]:
 
 
 def sweep_table(sweep: Sweep) -> str:
-    """A Markdown table: a row for each value of the first setting, a column for each of the second."""
+    """A Markdown table with a row for each value of the first setting and a column for each of the second."""
     rows, columns = next(iter(sweep.axes)), dict(list(sweep.axes.items())[1:])
     [(second, values)] = columns.items() or [("", [])]
     lines = [[f"{sweep.metric}: {rows}" + (f" \\ {second}" if second else ""), *(values or ["mean"])]]
@@ -148,7 +156,7 @@ def sweep_table(sweep: Sweep) -> str:
 
 
 def draw_sweep(sweep: Sweep) -> Figure:
-    """A heat map of two settings, a line over one."""
+    """A heat map over two settings, or a curve over one."""
     if len(sweep.axes) == 1:
         [(name, values)] = sweep.axes.items()
         return draw_line(sweep.metric, name, {value: sweep.cells.get((value,), []) for value in values})
@@ -162,10 +170,10 @@ def draw_sweep(sweep: Sweep) -> Figure:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m pirl_rl.sweeps", description="Table and heat map of a sweep.")
-    parser.add_argument("folder", metavar="DIR", type=Path, help="a multirun directory")
-    parser.add_argument("--metric", default="value_mse", help="a key of summary.json; default value_mse")
+    parser.add_argument("folder", metavar="DIR", type=Path, help="the directory of a sweep")
+    parser.add_argument("--metric", default="value_mse", help="a key of summary.json; default: value_mse")
     parser.add_argument("--axes", nargs="+", default=(), metavar="KEY", help="one or two of the settings that vary")
-    parser.add_argument("--out", metavar="FOLDER", type=Path, help="where sweep.md and sweep.png go; default DIR")
+    parser.add_argument("--out", metavar="FOLDER", type=Path, help="folder for sweep.md and sweep.png; default: DIR")
     options = parser.parse_args(arguments)
     try:
         sweep = gather(find_jobs(options.folder), options.metric, options.axes)

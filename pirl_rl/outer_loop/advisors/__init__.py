@@ -1,4 +1,4 @@
-"""Advisors plan a round's candidates from the record of the rounds before; `parse_plan` judges what they answer."""
+"""Advisors, which plan the candidates of a round from the history; `parse_plan` checks their answers."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from pirl_rl.outer_loop.history import History
 
 @dataclass(frozen=True)
 class Request:
-    """What a round asks.
+    """A request for the plan of a round.
 
     Attributes:
-        number: of the round, from 1.
-        candidates: how many the plan must have.
-        updates: length of each.
-        history: baseline and finished rounds.
-        prompt: the same in words, for advisors that read.
-        folder: for files of this asking; removed after the answer.
-        errors: what was wrong with the answer before, on the second time of asking.
+        number: number of the round, from 1.
+        candidates: number of candidates that the plan must have.
+        updates: number of updates of each candidate's training.
+        history: the baseline and the finished rounds.
+        prompt: the request as text, for advisors that read text.
+        folder: a folder for temporary files, which is removed after the answer.
+        errors: why the previous answer to this request was refused; empty at the first attempt.
     """
 
     number: int
@@ -34,12 +34,12 @@ class Request:
 
 
 class Advisor(Protocol):
-    """Anything that plans. The same request gets the same answer where an advisor can promise that."""
+    """Plans the rounds of an outer loop."""
 
     def propose(self, request: Request) -> str:
-        """The answer, the JSON of a `Plan` if all is well.
+        """Answer a request with the JSON of a `Plan`.
 
         Raises:
-            AdvisorError: no answer: a time-out, a crash, a server's error.
+            AdvisorError: if there is no answer, for example because of a time-out or a crash.
         """
         ...

@@ -1,4 +1,4 @@
-"""What comes from outside: answers that lie in files, and texts that messages quote."""
+"""Text from outside the package: answers in files, and text that messages quote."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from pirl_rl.outer_loop.parsing import MAX_ANSWER
 
 
 def read_answer(path: Path, limit: int = MAX_ANSWER) -> str:
-    """The text of a regular file; no link is followed and no pipe waited for.
+    """Read the text of a regular file; links are not followed, and pipes are not waited for.
 
     Args:
-        limit: bytes; a longer file is refused unread.
+        path: the file.
+        limit: largest number of bytes.
 
     Raises:
-        AdvisorError: there is no such file, or it is none of these.
+        AdvisorError: if there is no regular file, or it is longer than the limit.
     """
     try:
         with open(path, "rb", opener=_regular) as file:
@@ -39,5 +40,5 @@ def _regular(path: str, flags: int) -> int:
 
 
 def one_line(text: str) -> str:
-    """A text without line breaks and terminal codes."""
+    """Put a text on one line without control characters."""
     return " ".join("".join(letter if letter.isprintable() else " " for letter in text).split())

@@ -1,4 +1,4 @@
-"""Any program as an advisor: it reads a prompt file and writes a plan file. So a coding agent is plugged in."""
+"""An advisor that runs any program, such as a coding agent, which reads a prompt file and writes a plan file."""
 
 from __future__ import annotations
 
@@ -17,23 +17,29 @@ from typing import IO
 from pirl_rl.errors import AdvisorError, ArgumentError
 from pirl_rl.outer_loop.advisors import Request
 from pirl_rl.outer_loop.advisors.answer import one_line, read_answer
-from pirl_rl.outer_loop.prompt import asked
+from pirl_rl.outer_loop.prompt import request_text
 from pirl_rl.outer_loop.redaction import redact
 
 TAIL = 2_000
-"""Characters of a failed program's output that the error quotes."""
+"""Number of characters at the end of a failed program's output that the error quotes."""
 
-KEPT = 16 * TAIL
-"""Bytes of that output in memory: more than are quoted, so that a secret that is cut at their start is not."""
+BUFFERED = 16 * TAIL
+"""Number of bytes of that output in memory. It is larger than `TAIL`, so that a secret that is cut at the start of the
+buffer, where it cannot be recognised, is not quoted."""
 
 
 class Command:
-    """Runs a program, without a shell, in the round's folder: scripts among its arguments need absolute paths.
+    """Runs a program without a shell in a temporary folder, so that scripts among its arguments need absolute paths.
 
     Args:
-        command: its line, as in "my_agent --quiet {prompt} {plan}"; {prompt} and {plan} become paths of files, also
-            inside an argument. The program's output is ignored, but for its end where it fails.
-        timeout: seconds, after which it and all that it started are killed.
+        command: the command line, such as "my_agent --quiet {prompt} {plan}"; {prompt} and {plan} are replaced by the
+            paths of the two files, also inside an argument. If the program fails, the error quotes the end of its
+            output.
+        timeout: time in s after which the program and its child processes are killed.
+
+    Raises:
+        ArgumentError: if the command is no command line, has no {plan} or names no program, or the timeout is not
+            positive.
     """
 
     def __init__(self, command: str, timeout: float = 600.0):
@@ -42,10 +48,10 @@ class Command:
         except ValueError as error:
             raise ArgumentError(f"command: expected a program and its arguments, got {command!r} ({error})") from None
         if not any("{plan}" in argument for argument in self.arguments):
-            raise ArgumentError(f"command: expected {{plan}}, the file that the program is to write, in {command!r}")
+            raise ArgumentError(f"command: expected {{plan}}, the file that the program writes, in {command!r}")
         program = shutil.which(self.arguments[0])
         if program is None:
-            raise ArgumentError(f"command: there is no program {self.arguments[0]}")
+            raise ArgumentError(f"command: expected an executable program, got {self.arguments[0]}")
         if not timeout > 0:
             raise ArgumentError(f"timeout: expected seconds > 0, got {timeout}")
         self.arguments[0], self.timeout = str(Path(program).absolute()), timeout
@@ -54,31 +60,31 @@ class Command:
         attempt = 2 if request.errors else 1
         prompt, plan = (request.folder / f"advisor-{attempt}-{name}" for name in ("prompt.md", "plan.json"))
         try:
-            plan.unlink(missing_ok=True)  # of a round that was killed and is asked again
+            plan.unlink(missing_ok=True)  # an earlier attempt may have been killed
             prompt.unlink(missing_ok=True)
-            prompt.write_text(redact(asked(request)), encoding="utf-8")
+            prompt.write_text(redact(request_text(request)), encoding="utf-8")
         except OSError as error:
             raise AdvisorError(f"command: {error.filename}: {error.strerror}") from None
         files = {"{prompt}": str(prompt.absolute()), "{plan}": str(plan.absolute())}
-        line = [re.sub(r"\{prompt\}|\{plan\}", lambda found: files[found[0]], text) for text in self.arguments]
+        command = [re.sub(r"\{prompt\}|\{plan\}", lambda found: files[found[0]], text) for text in self.arguments]
         try:
-            _run(line, request.folder, self.timeout)
+            _run(command, request.folder, self.timeout)
             return read_answer(plan)
         finally:
-            for path in (prompt, plan):  # what was said is on record, without the secrets that a program may tell
+            for path in (prompt, plan):  # the record of the loop keeps both, without secrets
                 with contextlib.suppress(OSError):
                     path.unlink()
 
 
-def _run(line: Sequence[str], folder: Path, timeout: float) -> None:
-    """Run to the end, and kill what is left of its process group.
+def _run(command: Sequence[str], folder: Path, timeout: float) -> None:
+    """Run a program to its end, and kill the processes that remain in its group.
 
     Raises:
-        AdvisorError: it cannot be started, takes too long or fails.
+        AdvisorError: if the program cannot be started, takes too long or fails.
     """
     try:
         process = subprocess.Popen(
-            line,
+            command,
             cwd=folder,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -86,15 +92,15 @@ def _run(line: Sequence[str], folder: Path, timeout: float) -> None:
             start_new_session=True,
         )
     except (OSError, ValueError) as error:
-        raise AdvisorError(f"command: {line[0]} cannot be started: {error}") from None
+        raise AdvisorError(f"command: {command[0]} cannot be started: {error}") from None
     assert process.stdout is not None
     tail = _Tail(process.stdout)
     reason = ""
     try:
         if process.wait(timeout):
-            reason = f"{line[0]} ended with exit code {process.returncode}"
+            reason = f"{command[0]} ended with exit code {process.returncode}"
     except subprocess.TimeoutExpired:
-        reason = f"{line[0]} took longer than {timeout:g} s"
+        reason = f"{command[0]} took longer than {timeout:g} s"
     finally:
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, signal.SIGKILL)
@@ -104,7 +110,7 @@ def _run(line: Sequence[str], folder: Path, timeout: float) -> None:
 
 
 class _Tail(threading.Thread):
-    """Reads a stream to its end, or as long as anyone holds it, and keeps what came last."""
+    """Reads a stream until all its writers have closed it, and keeps its last bytes."""
 
     def __init__(self, stream: IO[bytes]):
         super().__init__(daemon=True)
@@ -114,9 +120,9 @@ class _Tail(threading.Thread):
     def run(self) -> None:
         with self.stream:
             while chunk := os.read(self.stream.fileno(), 65_536):
-                self.content = (self.content + chunk)[-KEPT:]
+                self.content = (self.content + chunk)[-BUFFERED:]
 
     def text(self) -> str:
-        self.join(timeout=1.0)  # a process that left the group may hold the stream open
+        self.join(timeout=1.0)  # a process that left the process group may keep the stream open
         text = one_line(redact(self.content.decode("utf-8", errors="replace"))[-TAIL:])
         return f"; its output ends with: {text}" if text else ""

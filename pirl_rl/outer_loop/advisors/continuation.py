@@ -1,4 +1,4 @@
-"""What the built-in advisors share: where a round's candidates start, and a sigmoid in units of their length."""
+"""Parts that the built-in advisors share: the starts of a round's candidates, and the shape of their schedules."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from pirl_rl.outer_loop.plan import START
 
 
 def starts(history: History, count: int) -> list[Result]:
-    """The best checkpoint for each candidate; where that is the loop's start, only the first of them restarts from it
-    once another checkpoint is sound.
+    """The start of each of `count` candidates: the best checkpoint.
+
+    If that is the loop's start and another result is sound, only the first candidate restarts from it, and the others
+    start from the best of these results.
     """
     best = history.best
     others = [result for result in history.results if history.keeps(result)]
@@ -21,16 +23,16 @@ def sigmoid(updates: int, share: float, slope: float) -> dict[str, float]:
     """Center and sharpness of a candidate's schedule.
 
     Args:
-        updates: its length.
-        share: of the length, at which the transition is half done.
-        slope: sharpness times length.
+        updates: number of updates of the candidate.
+        share: center as a share of these updates.
+        slope: sharpness times the number of updates.
     """
     return {
         "schedule_center": rounded(share * updates),
-        "schedule_sharpness": rounded(min(slope / updates, 10.0)),  # the schema's limit, met by very short candidates
+        "schedule_sharpness": rounded(min(slope / updates, 10.0)),  # a plan allows 10 at most
     }
 
 
 def rounded(value: float) -> float:
-    """Six significant digits: what a person can read and type again."""
+    """Round to six significant digits, so that plans are easy to read."""
     return float(f"{value:.6g}")

@@ -1,4 +1,4 @@
-"""A person's plans, or the replay of an earlier loop's."""
+"""An advisor that reads plans from a file, or replays those of an earlier loop."""
 
 from __future__ import annotations
 
@@ -11,14 +11,18 @@ from pirl_rl.outer_loop.advisors.answer import read_answer
 from pirl_rl.outer_loop.parsing import MAX_ANSWER
 
 MAX_FILE = 10 * MAX_ANSWER
+"""Largest number of bytes of a file with plans."""
 
 
 class File:
-    """Plans written before; read anew each round, so that they may be edited in between.
+    """Reads the plan of each round from a file. The file is read in every round, so that it may be edited in between.
 
     Args:
-        path: a JSON file with one plan, which is the first round's, or with a list of plans, round by round; or the
-            output directory of an earlier loop, whose rounds are replayed.
+        path: a JSON file with the plan of the first round or with a list of plans, one for each round; or the directory
+            of an earlier loop, whose plans are replayed.
+
+    Raises:
+        ArgumentError: if the path does not exist.
     """
 
     def __init__(self, path: str):
@@ -33,7 +37,7 @@ class File:
         try:
             content = json.loads(text)
         except (ValueError, RecursionError):
-            return text  # which the reader of plans refuses, with its reasons
+            return text  # `parse_plan` refuses it and gives the reasons
         plans = content if isinstance(content, list) else [content]
         if request.number > len(plans):
             raise AdvisorError(f"{self.path.name}: no plan for round {request.number}, it has {len(plans)}")

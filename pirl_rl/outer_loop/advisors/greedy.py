@@ -1,4 +1,4 @@
-"""The built-in advisor: it raises the physics' weights while success and reward hold, and backs off when they fall."""
+"""The default advisor: it raises the HJB and boundary weights while reward holds, and lowers them when it falls."""
 
 from __future__ import annotations
 
@@ -9,31 +9,37 @@ from pirl_rl.outer_loop.history import History, Result
 from pirl_rl.outer_loop.plan import Candidate, Plan
 
 FIRST = 1e-3
-"""Where a weight begins that was zero: the order of the paper's first."""
+"""The first positive value of a weight that was zero, of the order of the paper's first value."""
 
-NOUGHT = 1e-9
-"""Weights up to this count as zero."""
+NEGLIGIBLE = 1e-9
+"""Weights up to this value count as zero."""
 
 FIRST_JITTER = 0.005
+"""The smallest value to which the jitter is raised."""
+
 MOST_WEIGHT = 1e3
+"""The largest weight that a plan allows."""
 
 POWERS = (1, 1 / 2, 1 / 4, 1 / 8, 0, *range(-1, -65, -1))
-"""Growth to these powers, in the order in which they are tried: each step back halves the step up; then the weights are
-held, then lowered.
-"""
+"""The powers of `growth` by which weights are multiplied, in the order in which they are tried. The weights are raised
+by smaller and smaller steps, then held, then lowered."""
 
 
 class Greedy:
-    """Deterministic, and right for any history: what steps in for advisors that fail.
+    """A deterministic advisor that has a valid plan for any history, and is the fallback for other advisors.
 
-    HJB and boundary weights are multiplied by powers of `growth`; a round's candidates take powers in turn, and no
-    weights that are at least those of a candidate that fell. The TD weight and the share of replayed points stay.
-    Jitter rises with the weights, is held as soon as reward weakens and goes back with each further fall.
+    HJB and boundary weights are multiplied by powers of `growth`. The candidates of a round take different powers, and
+    none takes weights that are at least those of a fallen candidate from the same start, that is one that lost reward,
+    collapsed or failed. The TD weight and the replay share are kept. The jitter rises with the weights. It is held when
+    reward is below the baseline's or one candidate has fallen, and reduced with each further fall.
 
     Args:
-        growth: largest factor of a round; > 1.
-        jitter_growth: factor of a round for the jitter; > 1.
-        most_jitter: up to which it rises, in units of half the box's widths; at most 1.
+        growth: largest factor of the weights in a round, in (1, 10].
+        jitter_growth: factor of the jitter in a round, in (1, 10].
+        most_jitter: largest jitter, in half widths of the box of states, in [0, 1].
+
+    Raises:
+        ArgumentError: if an argument is out of its range.
     """
 
     def __init__(self, growth: float = 2.0, jitter_growth: float = 1.25, most_jitter: float = 0.1):
@@ -51,24 +57,24 @@ class Greedy:
         for number, start in enumerate(starts(request.history, request.candidates), 1):
             chosen.append(self._next(start, request, number, used))
             used.add(chosen[-1].settings)
-        plan = Plan(round_note="; ".join(map(_told, chosen))[:4_000], candidates=chosen)
+        plan = Plan(round_note="; ".join(map(_describe, chosen))[:4_000], candidates=chosen)
         return plan.model_dump_json(indent=1, exclude_none=True)
 
     def _next(self, start: Result, request: Request, number: int, used: set[tuple]) -> Candidate:
-        """The first continuation that is new and milder than all that fell from this start, or the mildest new one."""
+        """The first new candidate with lower weights than all that fell from this start, or the last new candidate."""
         fell = _fallen(start, request.history)
         jitter = self._jitter(start, request.history, len(fell))
         options = (self._candidate(start, power, jitter, number, request.updates) for power in POWERS)
         fresh = (option for option in options if option.settings not in used)
         option = None
         for option in fresh:
-            if not any(_as_harsh(option, other) for other in fell):
+            if not any(_as_large(option, other) for other in fell):
                 break
         return option or self._candidate(start, POWERS[-1], jitter, number, request.updates)
 
     def _candidate(self, start: Result, power: float, jitter: float | None, number: int, updates: int) -> Candidate:
         td, *physics = start.weights
-        final = [self._weight(now, power) for now in physics]
+        final = [self._weight(weight, power) for weight in physics]
         verb = "raise" if sum(final) > sum(physics) else "lower" if sum(final) < sum(physics) else "hold"
         return Candidate(
             name=f"{verb}-{number}",
@@ -79,26 +85,26 @@ class Greedy:
             **sigmoid(updates, share=0.5, slope=20.0),
         )
 
-    def _weight(self, now: float, power: float) -> float:
+    def _weight(self, initial: float, power: float) -> float:
         if power == 0:
-            return now
-        base = now if now > NOUGHT else FIRST / self.growth
+            return initial
+        base = initial if initial > NEGLIGIBLE else FIRST / self.growth
         return min(rounded(base * self.growth**power), MOST_WEIGHT)
 
     def _jitter(self, start: Result, history: History, falls: int) -> float | None:
-        """Its new value at the schedule's end, or None, which keeps it."""
-        now = start.collocation_jitter
-        if now is None:
+        """The jitter at the end of the schedule, or None to keep that of the start."""
+        initial = start.collocation_jitter
+        if initial is None:
             return None
         if falls > 1:
-            return min(rounded(now / self.jitter_growth ** (falls - 1)), 1.0)
+            return min(rounded(initial / self.jitter_growth ** (falls - 1)), 1.0)
         weak = start.metrics["reward"] < history.baseline.metrics["reward"]
-        raised = rounded(max(now * self.jitter_growth, FIRST_JITTER))
+        raised = rounded(max(initial * self.jitter_growth, FIRST_JITTER))
         return None if falls or weak or raised > self.most_jitter else raised
 
 
 def _fallen(start: Result, history: History) -> list[Candidate]:
-    """Continuations of a checkpoint that lost reward, collapsed or failed."""
+    """The candidates from a checkpoint that lost reward, collapsed or failed."""
     return [
         result.candidate
         for result in history.results
@@ -108,11 +114,12 @@ def _fallen(start: Result, history: History) -> list[Candidate]:
     ]
 
 
-def _as_harsh(option: Candidate, other: Candidate) -> bool:
+def _as_large(option: Candidate, other: Candidate) -> bool:
+    """Whether the final HJB and boundary weights of a candidate are at least those of another."""
     return all(a >= b for a, b in zip(option.schedule_final[1:], other.schedule_final[1:], strict=True))
 
 
-def _told(candidate: Candidate) -> str:
+def _describe(candidate: Candidate) -> str:
     (_, *before), (_, *after) = candidate.schedule_initial, candidate.schedule_final
     jitter = "" if candidate.collocation_jitter is None else f", jitter to {candidate.collocation_jitter:g}"
     return (

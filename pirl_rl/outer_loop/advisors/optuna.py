@@ -1,4 +1,4 @@
-"""Optuna plans: Bayesian or random search over the weights, the schedule's shape and the collocation's spread."""
+"""An advisor that searches loss weights, schedule and collocation by Bayesian or random search with Optuna."""
 
 from __future__ import annotations
 
@@ -25,19 +25,22 @@ from optuna.trial import FrozenTrial, create_trial
 
 
 class Optuna:
-    """Minimises calibration_mae; the study is rebuilt from the history each round, so that nothing is kept elsewhere.
+    """Minimises calibration_mae. The study is rebuilt from the history in each round, so that no other state is kept.
 
-    A candidate starts from the best checkpoint, with its weights, and keeps its TD weight. Searched are the logarithms
-    of the final HJB and boundary weights, the schedule's center and sharpness in units of the candidate's length and,
-    where the collocation has them, jitter and share of replayed points. Candidates that collapsed, failed or lost
-    reward count as twice the worst error seen.
+    Candidates start from the best checkpoint with the weights in force there, and keep its TD weight. The search is
+    over the logarithms of the final HJB and boundary weights, the center and the sharpness of the schedule in units of
+    the candidate's length and, if the collocation has them, jitter and replay share. A candidate that collapsed, failed
+    or lost reward counts with twice the largest error of the sound results.
 
     Args:
         sampler: "tpe", a tree-structured Parzen estimator, or "random".
-        seed: of the sampler, >= 0; each round of each seed has a stream of its own.
-        startup: finished candidates before TPE takes over from random draws.
-        weights: least and largest final weight, 0 < least < largest <= 1000.
+        seed: seed of the sampler, >= 0; every round has its own stream.
+        startup: number of finished candidates before TPE replaces random search.
+        weights: smallest and largest final weight, 0 < smallest < largest <= 1000.
         jitter: largest jitter, 0 < jitter <= 1.
+
+    Raises:
+        ArgumentError: if an argument is out of its range.
     """
 
     def __init__(
@@ -51,7 +54,7 @@ class Optuna:
         if sampler not in ("tpe", "random"):
             raise ArgumentError(f"sampler: expected 'tpe' or 'random', got {sampler!r}")
         if seed < 0 or startup < 1:
-            raise ArgumentError(f"expected seed >= 0 and startup >= 1, got {seed} and {startup}")
+            raise ArgumentError(f"seed, startup: expected seed >= 0 and startup >= 1, got {seed} and {startup}")
         if len(weights) != 2 or not 0 < weights[0] < weights[1] <= 1e3:
             raise ArgumentError(f"weights: expected [least, largest], 0 < least < largest <= 1000, got {list(weights)}")
         if not 0 < jitter <= 1:
@@ -62,7 +65,7 @@ class Optuna:
             "hjb": FloatDistribution(low, high),
             "boundary": FloatDistribution(low, high),
             "center": FloatDistribution(0.3, 0.7),
-            # From a slope of 10 on, the sigmoid begins at the weights in force and ends at the final ones.
+            # With a slope of at least 10 the sigmoid starts near the initial weights and ends near the final ones.
             "slope": FloatDistribution(10.0, 100.0, log=True),
             "jitter": FloatDistribution(0.0, jitter),
             "replay_share": FloatDistribution(0.5, 1.0),
@@ -91,7 +94,7 @@ class Optuna:
         return {name: values for name, values in self.space.items() if not absent.get(name, False)}
 
     def _finished(self, history: History, updates: int) -> list[FrozenTrial]:
-        """Those candidates that lie in the space, whoever planned them."""
+        """The finished candidates, of any advisor, that lie in the search space, as trials."""
         sound = [history.baseline, *(result for result in history.results if history.keeps(result))]
         penalty = 2 * max(result.metrics["calibration_mae"] for result in sound)
         trials = []
@@ -118,7 +121,10 @@ def _candidate(values: Mapping[str, float], start: Result, name: str, updates: i
 
 
 def _values(candidate: Candidate, result: Result, updates: int) -> dict[str, float]:
-    """A finished candidate's point of the space; what it left to its start is read from its end."""
+    """The point of a finished candidate in the search space.
+
+    A setting that the plan left out kept its value, which the result holds.
+    """
     _, hjb, boundary = candidate.schedule_final
     values = {
         "hjb": math.log10(hjb) if hjb > 0 else -math.inf,
