@@ -37,6 +37,7 @@ COLUMNS = (
 )
 """Column of the table, key of summary.json, statistic over the group's runs; columns that no run has are left out."""
 
+
 class RunRecord(NamedTuple):
     """What a finished run left: its group, the numbers of its summary, and the columns of its metrics."""
 
