@@ -45,7 +45,7 @@ def metrics_table(summary: Mapping[str, float], meanings: Mapping[str, str]) -> 
 
 
 def named_modules(overrides: Sequence[str]) -> list[str]:
-    """The modules of the `_target_`s that were typed."""
+    """The modules of the classes that typed `_target_` settings name."""
     targets = [value for key, _, value in (item.partition("=") for item in overrides) if key.endswith("_target_")]
     return [target.partition(".")[0] for target in targets]
 
