@@ -1,4 +1,4 @@
-"""The generator of the controlled SDE, Eq. (parabolic_operator) of the paper:
+"""The generator of the controlled SDE, Eq. (parabolic_operator):
 
     L^u V = -d_tau V + f(x, u) . grad_x V + 1/2 Tr(sigma sigma^T hess_x V).
 

@@ -27,7 +27,7 @@ class Payoff(Protocol):
 
 @dataclass(frozen=True)
 class Indicator:
-    """1_A, the payoff of the reach-avoid problem itself, Eq. (exit_value) of the paper."""
+    """1_A, the payoff of the reach-avoid problem itself, Eq. (exit_value)."""
 
     epsilon: float = 0.0
 
@@ -53,7 +53,7 @@ class _Smoothed:
 
 @dataclass(frozen=True)
 class LipschitzPayoff(_Smoothed):
-    """max(1 - dist(x, A_eps)/eps, 0), Eq. (continuous_terminal_cost) of the paper. epsilon in units of the level."""
+    """max(1 - dist(x, A_eps)/eps, 0), Eq. (continuous_terminal_cost). epsilon in units of the level."""
 
     def __call__(self, level: Tensor) -> Tensor:
         return self._ramp(level)

@@ -12,7 +12,7 @@ from pirl_rl.solution import Solution
 
 
 class Q(ActorRule):
-    """The mean of Q_1(y, pi(y)) over transitions, Eq. (actor_loss) of the paper."""
+    """The mean of Q_1(y, pi(y)) over transitions, Eq. (actor_loss)."""
 
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
         tau, x = replay["tau"], replay["state"]
