@@ -50,6 +50,7 @@ html_show_sourcelink = False
 html_show_sphinx = False
 
 reference_rooms = {
+    "api": ("From Python", ["pirl_rl.api"]),
     "problems": (
         "Problems, sets and payoffs",
         [
@@ -72,13 +73,23 @@ reference_rooms = {
             "pirl_rl.problems.drift.reference_states",
         ],
     ),
-    "numerics": ("Simulator and operators", ["pirl_rl.simulator", "pirl_rl.operators"]),
+    "numerics": ("Simulator and operators", ["pirl_rl.simulator", "pirl_rl.operators", "pirl_rl.internals"]),
     "networks": ("Networks and schedules", ["pirl_rl.networks", "pirl_rl.schedules"]),
     "sampling": (
         "States and points",
         ["pirl_rl.sampling.initial_states", "pirl_rl.sampling.collocation", "pirl_rl.sampling.boundary"],
     ),
-    "actor_rules": ("Actor rules", ["pirl_rl.actor_rules"]),
+    "actor_rules": (
+        "Actor rules",
+        [
+            "pirl_rl.actor_rules.base",
+            "pirl_rl.actor_rules.q",
+            "pirl_rl.actor_rules.hamiltonian",
+            "pirl_rl.actor_rules.look_ahead",
+            "pirl_rl.actor_rules.clipped_surrogate",
+            "pirl_rl.actor_rules.sum",
+        ],
+    ),
     "training": (
         "Environment, loss and training",
         [
@@ -90,6 +101,7 @@ reference_rooms = {
             "pirl_rl.guard",
             "pirl_rl.checkpoint",
             "pirl_rl.loggers",
+            "pirl_rl.progress",
         ],
     ),
     "collectors": (
@@ -106,7 +118,8 @@ reference_rooms = {
         "Solutions and evaluation",
         [
             "pirl_rl.solution",
-            "pirl_rl.evaluation",
+            "pirl_rl.evaluation.evaluator",
+            "pirl_rl.evaluation.inputs",
             "pirl_rl.evaluation.exact_error",
             "pirl_rl.evaluation.residuals",
             "pirl_rl.evaluation.success",
@@ -115,20 +128,52 @@ reference_rooms = {
             "pirl_rl.evaluation.reference_states",
             "pirl_rl.evaluation.slices",
             "pirl_rl.evaluation.rollouts",
+            "pirl_rl.evaluation.rollout_comparison",
             "pirl_rl.evaluation.trajectories",
             "pirl_rl.evaluation.monte_carlo",
         ],
     ),
-    "figures": ("Figures", ["pirl_rl.figures.run", "pirl_rl.figures.evidence", "pirl_rl.figures.sweep"]),
+    "figures": (
+        "Figures",
+        [
+            "pirl_rl.figures.evidence",
+            "pirl_rl.figures.run",
+            "pirl_rl.figures.training",
+            "pirl_rl.figures.one_dimensional",
+            "pirl_rl.figures.accuracy",
+            "pirl_rl.figures.slices",
+            "pirl_rl.figures.rollouts",
+            "pirl_rl.figures.comparison",
+            "pirl_rl.figures.sweep",
+            "pirl_rl.figures.tree",
+            "pirl_rl.figures.files",
+        ],
+    ),
     "runs": (
         "Runs and configuration",
         [
             "pirl_rl.runs.load",
             "pirl_rl.runs.compare",
             "pirl_rl.runs.sweeps",
+            "pirl_rl.run_directory",
+            "pirl_rl.renames",
             "pirl_rl.configuration",
             "pirl_rl.assembly",
             "pirl_rl.errors",
+        ],
+    ),
+    "commands": (
+        "Commands",
+        [
+            "pirl_rl.commands.composition",
+            "pirl_rl.commands.methods",
+            "pirl_rl.commands.settings",
+            "pirl_rl.commands.console",
+            "pirl_rl.commands.train",
+            "pirl_rl.commands.evaluate",
+            "pirl_rl.commands.export",
+            "pirl_rl.commands.tune",
+            "pirl_rl.commands.catalogue",
         ],
     ),
     "outer_loop": (

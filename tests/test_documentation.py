@@ -9,11 +9,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from pirl_rl.configuration import CONF
+from pirl_rl.commands.composition import compose
+from pirl_rl.commands.methods import check_method
 
 ROOT = Path(__file__).parent.parent
 TEXTS = [
@@ -26,12 +26,19 @@ NAMED = re.compile(r"`((?:pirl_rl|conf|benchmarks|docs|models|notebooks|tests)/[
 
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
+PRINTED = r"""
+python() { [[ $2 != pirl_rl.@(train|tune) ]] || { printf '%q ' python "$@"; echo; }; }
+pip() { :; }
+make() { :; }
+"""
+"""In place of running a shell block, its training commands are printed as the shell expands them, one a line."""
+
 
 def commands(text: str) -> list[str]:
-    """The lines of a text's shell blocks that train or tune, without comments, continued lines joined."""
-    blocks = "\n".join(re.findall(r"```bash\n(.*?)```", text, re.DOTALL)).replace("\\\n", " ")
-    lines = (line.strip() for line in blocks.splitlines())
-    return [line for line in lines if re.match(r"python -m pirl_rl\.(train|tune) ", line)]
+    """The commands of a text's shell blocks that train or tune, loops and functions of the shell expanded."""
+    blocks = [block for block in re.findall(r"```bash\n(.*?)```", text, re.DOTALL) if "pirl_rl.t" in block]
+    script = "\n".join(["shopt -s extglob", PRINTED, *blocks])
+    return subprocess.run(["bash", "-eu", "-c", script], capture_output=True, text=True, check=True).stdout.splitlines()
 
 
 COMMANDS = sorted({line for path in TEXTS for line in commands(path.read_text())})
@@ -63,10 +70,11 @@ def test_every_fence_is_closed(path):
     assert path.read_text().count("\n```") % 2 == 0
 
 
-@pytest.mark.parametrize("line", [line for line in COMMANDS if "$" not in line and "resume=" not in line])
+@pytest.mark.parametrize("line", [line for line in COMMANDS if " resume=" not in line])
 def test_every_command_composes(line):
-    """Hydra knows all groups and keys of a command; of a sweep the first combination is taken."""
-    _, _, module, *words = shlex.split(line, comments=True)
+    """Hydra knows all groups and keys of a command, and the experiment works with the method; of a sweep the first
+    combination is taken."""
+    _, _, module, *words = shlex.split(line)
     parser = OverridesParser.create()
     overrides = []
     for word in words:
@@ -77,13 +85,13 @@ def test_every_command_composes(line):
             word = f"{word.partition('=')[0]}={next(override.sweep_string_iterator())}"
         if not word.startswith("hydra"):
             overrides.append(word)
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose(module.rpartition(".")[2], overrides)
+    config = compose(module.rpartition(".")[2], overrides)
+    check_method(config, overrides)
     OmegaConf.to_container(config, resolve=True)
 
 
 def test_there_are_commands():
-    assert len(COMMANDS) > 10
+    assert len(COMMANDS) > 30
 
 
 @pytest.mark.slow

@@ -76,7 +76,7 @@ def test_actor_rule(tmp_path, examples):
     run = run_of("my_rule", tmp_path)
     assert json.loads((run / "summary.json").read_text())["updates"] == 30
 
-    own = ("actor_rule=own", "loss.actor_rule._target_=my_rule.GentleHamiltonian", "+loss.actor_rule.effort=0.02")
+    own = ("pirl.actor_rule._target_=my_rule.GentleHamiltonian", "+pirl.actor_rule.effort=0.02")
     loss = make_trainer(small_config(*own), trust=["my_rule"]).learner.loss
     tau, x = torch.rand(50, 1), torch.randn(50, 1)
     points = {"tau": tau, "state": x, "mask": torch.ones(50, dtype=torch.bool)}
@@ -102,7 +102,10 @@ def test_evaluator(tmp_path):
     assert 0 < summary["arrival_share"] < 1
     assert 0 < summary["arrival_time"] <= 2
     assert (run / "figures" / "arrivals.png").stat().st_size > 0
-    assert "1,000 paths of 2 s from random states" in " ".join((tmp_path / "printed.txt").read_text().split())
+    printed = " ".join((tmp_path / "printed.txt").read_text().split())
+    paths = "1,000 paths of 2 s from random states in the box"
+    assert f"The share of {paths} that reaches the target." in printed
+    assert f"The mean time of arrival in s of those of {paths} that reach the target." in printed
 
 
 def test_collector(tmp_path):

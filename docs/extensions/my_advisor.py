@@ -10,10 +10,10 @@ class Ladder:
     """Each candidate of a loop ends with a higher weight of the HJB loss than the candidate before it.
 
     Args:
-        factor: between one weight and the next, above 1.
+        factor: the ratio of one weight to the one before it, above 1.
 
     Raises:
-        ArgumentError: a factor up to 1.
+        ArgumentError: a factor that is not above 1.
     """
 
     def __init__(self, factor: float = 1.5):

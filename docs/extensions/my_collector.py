@@ -13,10 +13,10 @@ class FrontLoaded(SyncCollector):
 
     Args:
         env: the environment, which the package hands over.
-        actor: the actor in training, likewise.
-        updates_per_batch: updates between two batches, later on.
-        early: how many updates count as the start.
-        factor: how much more often batches are played there; it divides `updates_per_batch`.
+        actor: the actor in training, which the package hands over too.
+        updates_per_batch: updates between two batches after the first `early` updates.
+        early: the number of updates that count as the start of the run.
+        factor: batches are played this many times as often there; it divides `updates_per_batch`.
         settings: the other arguments of `SyncCollector`.
 
     Raises:

@@ -1,4 +1,4 @@
-"""An evaluator of one's own: when do the paths of the learned policy arrive? Two metrics and a figure."""
+"""An evaluator of one's own: the times at which paths arrive, with two metrics and a figure."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ class ArrivalsEvidence:
 
     Attributes:
         times: time of arrival of each path that reached the target, s.
-        paths: how many paths were simulated.
+        paths: the number of paths that were simulated.
     """
 
     times: Tensor
@@ -35,8 +35,8 @@ class Arrivals:
     """Paths over the whole horizon from random states in the box.
 
     Args:
-        paths: how many, at least 1.
-        seed: of states and noise.
+        paths: their number, at least 1.
+        seed: seed of the states and the noise.
 
     Raises:
         ArgumentError: no path.

@@ -1,4 +1,4 @@
-"""A problem of one's own: a ferry that shall reach its pier before wind and waves drive it onto the rocks."""
+"""A problem of one's own: a ferry reaches its pier before wind and waves drive it onto the rocks."""
 
 import torch
 from torch import Tensor

@@ -14,7 +14,7 @@ class GentleHamiltonian(ActorRule):
 
     Args:
         problem: the physics, which the package hands to every rule that asks for it.
-        effort: price of a control at its bound, 1/s, not negative.
+        effort: the price of a control at its bound, in 1/s, not negative.
 
     Raises:
         ArgumentError: a negative effort.
