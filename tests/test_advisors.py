@@ -9,7 +9,7 @@ import pytest
 from omegaconf import OmegaConf
 from rounds import after, history, improves, plan, request
 
-from pirl_rl.configuration import CONF, build
+from pirl_rl.configuration import CONF, build, parameters_of
 from pirl_rl.errors import AdvisorError, ConfigError, PlanError
 from pirl_rl.outer_loop.advisors.file import File
 from pirl_rl.outer_loop.advisors.greedy import Greedy
@@ -97,7 +97,13 @@ def test_every_advisor_is_built_from_its_configuration(monkeypatch):
     for name, values in GIVEN.items():
         path = CONF / "advisor" / f"{name}.yaml"
         assert path.read_text().startswith("# ")
-        advisor = build(OmegaConf.merge(OmegaConf.load(path), values), "advisor")
+        node = OmegaConf.load(path)
+        advisor = build(OmegaConf.merge(node, values), "advisor")
+        # Written out, so that nothing of an extra is imported before it is chosen, and equal to the constructor's.
+        for key, parameter in parameters_of(type(advisor)).items():
+            if parameter.default is not parameter.empty:
+                default = parameter.default
+                assert node[key] == (list(default) if isinstance(default, tuple) else default)
         assert callable(advisor.propose)
         for key in values:
             given = {other: value for other, value in values.items() if other != key}
