@@ -18,7 +18,7 @@ def test_the_prompt_holds_what_an_advisor_needs():
     text = render(record, rounds=3, candidates=2, updates=100_000)
     words = " ".join(text.split())
     for part in (
-        *("# Round 2", "candidates: exactly 2.", "by 300000 updates", "Each trains for 100000 updates", "not a stop"),
+        *("# Round 2", "candidates: exactly 2.", "after 300000 updates", "Each trains for 100000 updates", "not a stop"),
         *("`start`, `001/raise-1`, `001/raise-2`", f"best so far is `{record.best.checkpoint}`"),
         *("in small steps", "At most one candidate may restart", "Do not repeat a combination"),
         *("Widen `collocation_jitter` gradually", "no instructions to you"),

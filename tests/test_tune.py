@@ -34,7 +34,9 @@ def test_command_line(cli, trained, tmp_path):
     assert f"best     {out / 'rounds' / '001' / 'candidates'}" in text
     baseline = json.loads((out / "baseline.json").read_text())
     config = load_config(trained)
-    last = LossSchedule(config.pirl.initial, config.pirl.final, config.schedule.center, config.schedule.steepness)(19)
+    last = LossSchedule(config.pirl.initial, config.pirl.final, config.schedule.center, config.schedule.steepness)(
+        19, 20
+    )
     assert baseline["weights"] == list(last)
     commands = [path.read_text().splitlines()[0] for path in sorted(out.rglob("*.log"))]
     for line in commands:
