@@ -1,4 +1,4 @@
-"""How the commands report errors: a misfit is one line, a bug keeps its traceback and says where it is."""
+"""Reports of errors by the commands: a refused setting is one line, a bug keeps its traceback and names its place."""
 
 from __future__ import annotations
 

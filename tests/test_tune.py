@@ -1,4 +1,4 @@
-"""The command line of the outer loop, with a fake training and with real ones."""
+"""The command `tune`, with a fake training and with real ones."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_a_program_s_line_is_typed_as_for_any_shell(cli, trained, tmp_path):
     code, text = cli(*line, *typed)
     assert code == 0, text
     assert "round 1 (command)" in text
-    resumed = sys.argv[1:]  # what the hint repeats
+    resumed = sys.argv[1:]  # the hint on how to resume repeats the arguments
     assert resumed[-1] != typed[-1]
     assert cli(*resumed)[0] == 0
     assert sys.argv[1:] == resumed
