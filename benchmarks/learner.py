@@ -3,8 +3,7 @@
     python benchmarks/learner.py [--rounds 60] [--updates 4]
 
 An update computes the TD, HJB and boundary losses with their gradients, makes a step of fused Adam, and every second
-time updates the actor and the target networks. All variants have equal networks, points and optimisers, and the same
-loop.
+time updates the actor and the target networks too. All variants have equal networks, points, optimisers and loops.
 "nested autograd" differentiates both critics at once by one gradient with create_graph and one Hessian-vector product
 per noise channel. These derivatives cannot be compiled; the other terms run eagerly too, or compiled in "nested, others
 compiled". "HJB term" is this loss alone, forward and backward. The variants take turns of a few updates each, and times

@@ -51,6 +51,8 @@ def build(node: Any, key: str, trust: Sequence[str] = (), parts: Mapping[str, An
         ConfigError: for an unknown or forbidden target, an unknown key, a wrong type, or a `PirlError` of the
             constructor, which refuses an argument. Any other error of a constructor is a bug and is left unchanged.
     """
+    if isinstance(node, DictConfig) and OmegaConf.is_missing(node, "_target_"):
+        raise ConfigError(f"{key}._target_: a value is missing, expected {key}._target_=my_module.MyClass")
     if not isinstance(node, DictConfig) or "_target_" not in node:
         raise ConfigError(f"{key}: expected settings with a _target_, got {node!r}")
     parts = parts or {}

@@ -1,5 +1,8 @@
-"""Stands for a coding agent, as a program with two files or as a function of the prompt: raises the HJB weight of the
-last result while its reward holds, else goes back to the best with a smaller one."""
+"""A substitute for a coding agent, as a program with two files or as a function of the prompt.
+
+It raises the HJB weight of the last result while its reward holds, and else returns to the best result with a smaller
+weight.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A chat endpoint on the loopback, which answers as a test says."""
+"""A chat endpoint on the loopback interface with the answers that a test defines."""
 
 from __future__ import annotations
 

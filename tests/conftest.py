@@ -1,4 +1,4 @@
-"""What tests of the commands share."""
+"""Fixtures that the tests of the commands share."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from small import small_trainer
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> Path:
-    """A run to start from."""
+    """The directory of a run from which others start."""
     folder = tmp_path_factory.mktemp("trained")
     small_trainer(folder, "trainer.updates=20").train()
     return folder

@@ -1,4 +1,4 @@
-"""Slow, obvious versions of what the package computes fast, and the problems the tests run over."""
+"""Slow but simple implementations of functions of the package, and problems that several tests use."""
 
 from __future__ import annotations
 

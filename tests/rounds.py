@@ -45,7 +45,7 @@ def plan(*names: str, hjb: float = 0.2) -> dict:
 
 
 def after(record: History, answer: str, count: int, play: Callable[[Candidate], dict]) -> History:
-    """The history with one more round: `play` says what became of each candidate of a plan, which must be valid."""
+    """The history with one more round from a valid plan; `play` returns changes to the result of each candidate."""
     number = len(record.rounds) + 1
     candidates = parse_plan(answer, record, count).candidates
     results = [
@@ -69,7 +69,7 @@ def improves(candidate: Candidate) -> dict:
 
 
 def fate(rng: np.random.Generator):
-    """Anything that can become of a candidate."""
+    """A random outcome of a candidate."""
 
     def play(candidate: Candidate) -> dict:
         status = rng.choice(["done", "done", "collapsed", "failed"])
@@ -102,11 +102,11 @@ QUIET = {"reward": 0.8, "calibration_mae": 0.04, "success_rate": 0.8}
 
 
 class Killed(BaseException):
-    """SIGKILL, as far as a test can raise it."""
+    """An exception that stands for SIGKILL."""
 
 
 class Clock:
-    """Kills at the k-th of the moments that count."""
+    """Raises `Killed` at the k-th of the counted moments."""
 
     def __init__(self, last: int = -1):
         self.moments, self.last = 0, last
@@ -165,7 +165,7 @@ def write_json(path: Path, data) -> None:
 
 
 class Scripted:
-    """Answers in turn; the last one for ever. Exceptions are raised, callables called with the request."""
+    """Gives its answers in turn and repeats the last one. Exceptions are raised, callables called with the request."""
 
     def __init__(self, *answers):
         self.answers, self.requests = list(answers), []

@@ -1,4 +1,4 @@
-"""Runs of seconds: the debug configuration, composed, built and compared."""
+"""Runs of a few seconds with the debug configuration: their composition, assembly and comparison."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def resumed(folder: Path, *overrides: str) -> Trainer:
 
 
 def metrics(evaluator, solution, **steps) -> dict[str, float]:
-    """What an evaluator makes of a solution, under a simulator of the given dt, substeps and crossing."""
+    """The metrics of an evaluator under a simulator with the given dt, substeps and crossing."""
     return evaluator(solution, Simulator(solution.problem, **steps)).metrics()
 
 
@@ -73,7 +73,7 @@ def interrupt() -> None:
 
 
 def assert_same(a, b, path: str = "state") -> None:
-    """Equal bit for bit, but for the time taken."""
+    """Require that two states are equal bit for bit, except for the time taken."""
     assert type(a) is type(b), path
     if isinstance(a, torch.Tensor):
         assert torch.equal(a, b), path
@@ -90,7 +90,7 @@ def assert_same(a, b, path: str = "state") -> None:
 
 
 def command(*arguments: str, cwd: Path, module: str = "pirl_rl.train", **environment: str):
-    """A real command line, from a directory of the test's own."""
+    """Run a module's command line in a new process from the directory `cwd`."""
     path = os.pathsep.join(filter(None, [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]))
     environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", **environment}
     line = [sys.executable, "-m", module, *arguments]
@@ -98,7 +98,7 @@ def command(*arguments: str, cwd: Path, module: str = "pirl_rl.train", **environ
 
 
 def wait_for(condition) -> None:
-    """Return when another process has made it true, two minutes at most."""
+    """Wait until another process has made a condition true, for two minutes at most."""
     end = time.monotonic() + 120
     while not condition():
         assert time.monotonic() < end

@@ -141,7 +141,7 @@ def test_evidence_is_drawn_by_its_class():
 
 
 class Mine(Metrics):
-    """Evidence of a class that the package does not know."""
+    """A class of evidence that is not part of the package."""
 
 
 def test_a_class_of_evidence_registers_what_draws_it():

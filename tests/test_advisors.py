@@ -1,4 +1,4 @@
-"""What all advisors share: what counts as sound, plans in files, and their configuration."""
+"""All advisors: sound results, plans in files, and the configuration of advisors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Programs as advisors: no shell, no process left behind, and nothing that they do wrong gets past."""
+"""Programs as advisors: they run without a shell, leave no process behind, and their faults are reported."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def program(tmp_path):
 
 @pytest.fixture
 def folder(tmp_path):
-    """A round's, whose name no shell and no template should ever read."""
+    """The folder of a round, whose name a shell or a template would misread."""
     path = tmp_path / "a b; touch {plan} $(touch proof) '\""
     path.mkdir()
     return path
@@ -89,7 +89,7 @@ BAD = {
 def test_what_a_program_gets_wrong(case, program, folder):
     source, message = BAD[case]
     agent = program(source)
-    for _ in range(2):  # what it leaves behind is no hindrance, and no answer to the next question
+    for _ in range(2):  # files of the first attempt must neither hinder the second nor answer it
         with pytest.raises(AdvisorError, match=message):
             agent.propose(request(history(), folder))
 
@@ -123,7 +123,7 @@ def test_a_time_out_ends_all_that_a_program_started(program, folder, tmp_path):
         agent.propose(request(history(), folder))
     with lock.open() as file:
         assert file.read().startswith("ready")
-        fcntl.flock(file, fcntl.LOCK_EX)  # held by the sleeper as long as it lives
+        fcntl.flock(file, fcntl.LOCK_EX)  # the sleeping process holds this lock until it ends
 
 
 def test_a_program_leaves_no_process_behind(program, folder, tmp_path):

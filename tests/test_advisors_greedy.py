@@ -1,4 +1,4 @@
-"""Greedy: what it does as results come in, and that any history leads to a valid plan."""
+"""Greedy: its plans after given results, and valid plans for any history."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The chat endpoint's advisor against a server on the loopback, which does all that servers do."""
+"""The advisor at a chat endpoint, against a server on the loopback interface with all kinds of failures."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def silent(handler: Handler) -> None:
 
 
 def dripping(handler: Handler) -> None:
-    """A byte now and then: no single one is late."""
+    """Send one byte at a time, each of them within any time-out between bytes."""
     handler.send_response(200)
     handler.end_headers()
     with contextlib.suppress(OSError):
@@ -63,14 +63,14 @@ def advisor(server, monkeypatch):
 
 @pytest.fixture
 def waits(monkeypatch):
-    """The seconds that were to be waited."""
+    """The list of waiting times in s, which are not really waited."""
     waited: list[float] = []
     monkeypatch.setattr(openai.time, "sleep", waited.append)
     return waited
 
 
 def refused(advisor: OpenAI) -> str:
-    """The message of the refusal; the key stands nowhere in it, nor in its causes."""
+    """The message of the error, which like its causes must not hold the key."""
     with pytest.raises(AdvisorError) as caught:
         advisor.propose(request(history()))
     assert KEY not in "".join(traceback.format_exception(caught.value))

@@ -1,4 +1,4 @@
-"""Optuna: that it learns, repeats itself, and plans for any history."""
+"""Optuna: it learns from results, is deterministic, and has a valid plan for any history."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_no_round_of_a_seed_repeats_one_of_another():
 
 
 def test_optuna_learns_from_the_record_and_random_does_not():
-    """The same candidates with their fates turned round."""
+    """The same candidates with their errors in reverse order."""
     for sampler, same in [("tpe", False), ("random", True)]:
         record = searched(Optuna(sampler), 3)
         turned = record.model_copy(

@@ -1,4 +1,4 @@
-"""The road from Python: the same runs as the command line's, and what a run answers."""
+"""The Python interface: equal runs to those of the command line, and the methods of a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Candidates: their command lines, what they and the start come to, and what is told of their failures."""
+"""Candidates: their command lines, their results and failures, and the result of the start."""
 
 from __future__ import annotations
 

@@ -140,7 +140,7 @@ def test_weights_are_files_of_the_run(run, tmp_path):
 
 @pytest.mark.slow
 def test_killed_training_at_twenty_random_moments(tmp_path):
-    """Every checkpoint left behind loads, and training goes on from there, each time until the next kill."""
+    """Every checkpoint left behind loads, and training continues from it until the next kill."""
     rng, folder = random.Random(1), tmp_path / "run"
     small_trainer(folder, "trainer.updates=1000000", "trainer.checkpoint_every=2", "evaluation.during=[]").save()
     reached = 0

@@ -1,4 +1,4 @@
-"""From nodes to objects: what may be built, and what a foreign run directory cannot do."""
+"""Objects from configuration nodes: what may be built, and that a foreign run directory runs no code."""
 
 from __future__ import annotations
 

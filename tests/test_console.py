@@ -1,4 +1,4 @@
-"""How the commands report errors: a misfit is one line, a bug keeps its traceback and says where it is."""
+"""Reports of errors by the commands: a refused setting is one line, a bug keeps its traceback and names its place."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from pirl_rl.commands.console import reported
 from pirl_rl.configuration import build
 from pirl_rl.errors import ArgumentError, ConfigError, PlanError
 from pirl_rl.problems import Reach1D
+
+OWN = ("+experiment=own", *QUICK[1:])
 
 BROKEN = """
 import torch
@@ -60,7 +62,7 @@ def cli(in_process, tmp_path, monkeypatch):
 )
 def test_a_bug_of_the_user_s_keeps_its_traceback(target, line, last, cli, tmp_path):
     before = sorted(path.name for path in tmp_path.iterdir())
-    code, text = cli(*QUICK, f"env.problem._target_={target}")
+    code, text = cli(*OWN, f"env.problem._target_={target}")
     assert code == 1
     assert "Traceback (most recent call last)" in text
     final = text.strip().splitlines()[-1]
@@ -70,7 +72,7 @@ def test_a_bug_of_the_user_s_keeps_its_traceback(target, line, last, cli, tmp_pa
 
 
 def test_a_refusal_is_one_line(cli):
-    code, text = cli(*QUICK, "env.problem._target_=broken.Choosy")
+    code, text = cli(*OWN, "env.problem._target_=broken.Choosy")
     assert (code, text) == (1, "error: env.problem: speed: expected a number > 0, got -1\n")
 
 

@@ -1,4 +1,4 @@
-"""Stages: where they start, how they fill a run, and what the trainer takes over from them."""
+"""Stages: their starts, their shares of a run, and the settings that the trainer takes from them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Exports: small directories that open like the runs they came from."""
+"""Exports: small directories that open like the runs from which they were made."""
 
 from __future__ import annotations
 

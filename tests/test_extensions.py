@@ -116,7 +116,7 @@ def test_collector(tmp_path):
 
 
 def test_advisor(tmp_path, trained):
-    """The first plan goes on from the start with 1.2 times its HJB weight, and its candidate is trained."""
+    """The first plan continues from the start with 1.2 times its HJB weight, and its candidate is trained."""
     small = ("+debug=default", "env.num_envs=32", "collector.frames_per_batch=64", "collector.warmup_frames=64")
     loop = ("rounds=1", "candidates=1", "updates=10", "out=loop")
     run_command("my_advisor", tmp_path, *small, *loop, RUN_DIR=str(trained))

@@ -1,4 +1,4 @@
-"""The same on a CUDA device: physics, losses, training, runs that change machines."""
+"""A CUDA device against the CPU: physics, losses, training, and runs that change the device."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The guard: what it takes for noise and what for collapse, and that a run comes back whole from one."""
+"""The guard: the distinction of noise and collapse, and the rollback of a run after a collapse."""
 
 from __future__ import annotations
 

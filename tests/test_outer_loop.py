@@ -1,4 +1,4 @@
-"""The outer loop with a launcher that trains nothing: what it asks, runs and decides, whatever advisors say."""
+"""The outer loop with a launcher that trains nothing: its requests, jobs and decisions for answers of any kind."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a loop keeps: enough to go on from any moment, and no secret."""
+"""The record of a loop: a killed loop can be resumed from any moment, and no file holds a secret."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def slow(request) -> str:
 
 
 def tree(out: Path) -> dict[str, str]:
-    """All that a loop decided and measured."""
+    """The files with all decisions and results of a loop."""
     found = (path for path in out.rglob("*") if path.is_file() and path.suffix != ".log" and path.name != LOCK)
     kept = {str(path.relative_to(out)): path for path in found if path.suffix != ".pt"}
     return {name: _timeless(path).replace(str(out), "out") for name, path in kept.items()}

@@ -1,4 +1,4 @@
-"""Processes of an outer loop: side by side, stopped with it, and none left behind."""
+"""Processes of an outer loop: they run in parallel, stop with the loop, and none remains."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_an_interrupt_lets_the_others_save(tmp_path):
 
 
 def test_a_signal_at_any_moment_is_heard(tmp_path):
-    """Also in the middle of a fork, where an exception would be lost."""
+    """A signal in the middle of a fork, where an exception would be lost, counts too."""
     sleepers = [script(name, "time.sleep(60)", tmp_path) for name in "abc"]
     once = [lambda: os.kill(os.getpid(), signal.SIGINT)]
     os.register_at_fork(before=lambda: once.pop()() if once else None)

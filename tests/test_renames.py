@@ -1,4 +1,4 @@
-"""Configurations of format 1 in the present one's words."""
+"""Conversion of configurations of format 1."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_actor_rules(loss, noise, rule):
 
 
 def test_stages():
-    """A stage says only what it changes, and its schedule counts the updates of the run."""
+    """A stage holds only the settings that it changes, and its schedule counts the updates of the run."""
     schedule = {"_target_": "pirl_rl.schedules.LossSchedule", "center": 2.0, "steepness": 3.0}
     linear = {"_target_": "pirl_rl.schedules.LinearSchedule", "start": 0.5, "end": 1.0}
     stages = [

@@ -1,4 +1,4 @@
-"""A new run that begins with what another one learned."""
+"""New runs that start with the networks of another run."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def begun(folder, start, *overrides: str) -> Trainer:
 
 
 def transitions(state: dict, cursor: int = 0) -> dict[tuple | str, torch.Tensor]:
-    """Those of a buffer's state from its cursor on, around its end."""
+    """The transitions of a buffer's state, from the oldest to the newest."""
     parts = state["transitions"]
     flat = {key: parts["next"][key[1]] if isinstance(key, tuple) else parts[key] for key in TRANSITION}
     return {key: entry.roll(-cursor, 0) for key, entry in flat.items()}

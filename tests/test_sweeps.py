@@ -1,4 +1,4 @@
-"""Tables and figures of sweeps, from directories as Hydra and training leave them."""
+"""Tables and figures of sweeps, from directories like those that Hydra and training write."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def mse(i: int, j: int) -> float:
 
 @pytest.fixture
 def square(tmp_path):
-    """5 x 5 settings with two seeds each; at one both failed, at one a single one, and one was never tried."""
+    """5 x 5 settings with two seeds: both runs failed in one cell, one run in another, and one cell has no runs."""
     folder = tmp_path / "square"
     for i, center in enumerate(CENTERS):
         for j, steepness in enumerate(STEEP):

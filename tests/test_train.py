@@ -1,4 +1,4 @@
-"""The command line: what is trained, what is refused, what is left behind."""
+"""The command `train`: its runs, the settings that it refuses, and the files that it leaves."""
 
 from __future__ import annotations
 
@@ -268,7 +268,7 @@ def test_without_a_compiler_it_warns_once_and_trains(environment, tmp_path):
 
 
 def start(folder: Path, *arguments: str) -> subprocess.Popen:
-    """Training for ever, from its first row of metrics on."""
+    """Start a training without end, and return after its first row of metrics."""
     environment = {**os.environ, "PYTHONPATH": str(CONF.parent), "OMP_NUM_THREADS": "1"}
     line = [sys.executable, "-m", "pirl_rl.train", *QUICK, *SMALL, "trainer.updates=1000000", *arguments]
     child = subprocess.Popen(line, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True)

@@ -1,4 +1,4 @@
-"""The command line of the outer loop, with a fake training and with real ones."""
+"""The command `tune`, with a fake training and with real ones."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def test_command_line(cli, trained, tmp_path):
     assert f"best     {out / 'rounds' / '001' / 'candidates'}" in text
     baseline = json.loads((out / "baseline.json").read_text())
     config = load_config(trained)
-    last = LossSchedule(config.pirl.initial, config.pirl.final, config.schedule.center, config.schedule.steepness)
-    last = last(19, 20)
+    schedule = LossSchedule(config.pirl.initial, config.pirl.final, config.schedule.center, config.schedule.steepness)
+    last = schedule(19, 20)
     assert baseline["weights"] == list(last)
     commands = [path.read_text().splitlines()[0] for path in sorted(out.rglob("*.log"))]
     for line in commands:
@@ -107,7 +107,7 @@ def test_a_program_s_line_is_typed_as_for_any_shell(cli, trained, tmp_path):
     code, text = cli(*line, *typed)
     assert code == 0, text
     assert "round 1 (command)" in text
-    resumed = sys.argv[1:]  # what the hint repeats
+    resumed = sys.argv[1:]  # the hint on how to resume repeats the arguments
     assert resumed[-1] != typed[-1]
     assert cli(*resumed)[0] == 0
     assert sys.argv[1:] == resumed

@@ -1,4 +1,4 @@
-"""The outer loop with real trainings, real programs and a real server: a few seconds a candidate, minutes in all."""
+"""The outer loop with real trainings, programs and a server; a candidate takes seconds, all tests minutes."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def decided(out: Path) -> dict[str, str]:
 
 
 def plans(*names: str) -> list[dict]:
-    """A person's: a chain of candidates, a round each."""
+    """Plans in a file: a chain of candidates, one for each round."""
     made = [json.loads(answer(candidate(name, schedule_final=(1, 0.1 * i, 1)))) for i, name in enumerate(names, 1)]
     for i, (before, plan) in enumerate(zip(names, made[1:], strict=False), 1):
         plan["candidates"][0]["start_checkpoint"] = f"{i:03d}/{before}"
@@ -63,7 +63,7 @@ def plans(*names: str) -> list[dict]:
 
 
 def three_rounds(advisor: str, folder: Path, *arguments: str, **environment: str) -> list[dict]:
-    """Their results.json, with plan and prompt."""
+    """The results.json of three rounds, with their plans and prompts."""
     done = command(
         *arguments, f"advisor={advisor}", "candidates=1", "rounds=3", cwd=folder, module="pirl_rl.tune", **environment
     )
@@ -143,7 +143,7 @@ def test_parallel_changes_nothing(trained, tmp_path):
 
 @pytest.fixture
 def hearing():
-    """A shell lets what it starts in the background ignore SIGINT, which is passed on to all that is started here."""
+    """Receive SIGINT, which a shell makes its background processes and their children ignore."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -186,7 +186,7 @@ def test_sigkill_at_random_moments_leads_to_the_same_tree(advisor, trained, tmp_
         loop = start(tmp_path, *real(outs[-1], trained, *settings))
         try:
             loop.communicate(timeout=rng.uniform(0.1, 0.5) * took)
-            outs.append(f"killed{killed}")  # this one came to its end, the next begins anew
+            outs.append(f"killed{killed}")  # this candidate has ended, and the next starts from the beginning
         except subprocess.TimeoutExpired:
             loop.kill()
             loop.communicate()
