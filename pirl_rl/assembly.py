@@ -1,11 +1,10 @@
-"""Assembly of a trainer and its parts from a configuration, and their restoration from a checkpoint."""
+"""Assembly of a trainer and its parts from a configuration."""
 
 from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,16 +12,13 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 
-from pirl_rl import checkpoint
-from pirl_rl.checkpoint import check_entries, check_module
-from pirl_rl.configuration import build, convert
+from pirl_rl.building import build, convert
 from pirl_rl.curriculum import Stage
 from pirl_rl.envs import ReachAvoidEnv
-from pirl_rl.errors import ArgumentError, CheckpointError, ConfigError
+from pirl_rl.errors import ConfigError
 from pirl_rl.evaluation import Evaluator
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.run_directory import RunDirectory
 from pirl_rl.simulator import Simulator
 from pirl_rl.trainer import Trainer
 
@@ -156,80 +152,3 @@ def make_evaluators(config: DictConfig, when: str, trust: Sequence[str]) -> dict
     if not isinstance(names, ListConfig) or not all(name in known for name in names):
         raise ConfigError(f"evaluation.{when}: expected a list of names out of {', '.join(known)}, got {names}")
     return {name: build(config[name], f"evaluation.{name}", trust) for name in names}
-
-
-def restore(trainer: Trainer) -> None:
-    """Restore the state of a trainer from the last checkpoint of its run directory.
-
-    Raises:
-        CheckpointError: if the checkpoint is missing, broken or of another configuration.
-        ConfigError: if the run has already made more than `trainer.updates` updates.
-    """
-    assert trainer.folder is not None
-    path = RunDirectory(trainer.folder).last
-    state = checkpoint.load(path)
-    with fitting(path):
-        expected = trainer.state_dict()
-        if state.get("rollback") is None:
-            del expected["rollback"]  # a resumed run may switch the guard on
-        _check_learner(state, expected.pop("learner"))
-        check_entries(state, expected)
-    trainer.load_state_dict(state)
-    if trainer.update > trainer.updates:
-        message = f"expected at least {trainer.update}, which {trainer.folder} has made, got {trainer.updates}"
-        raise ConfigError(f"trainer.updates: {message}")
-
-
-def start_from(trainer: Trainer, start: str) -> Path:
-    """Load the networks and target networks of another run into a new trainer.
-
-    A `last.pt` also gives the optimisers and the transitions of the replay buffer, except after a collapse: those
-    transitions were played by the collapsed policy.
-
-    Args:
-        trainer: the new trainer, which keeps its seeds and counts its updates from 0.
-        start: a run directory, whose newest checkpoint is taken, or a file in its `checkpoints/`.
-
-    Returns:
-        The absolute path of the checkpoint.
-
-    Raises:
-        CheckpointError: if the checkpoint is missing, broken or of another configuration.
-    """
-    path = RunDirectory(start).newest() if Path(start).is_dir() else Path(start)
-    state = checkpoint.load(path)
-    learner, buffer = trainer.learner, None
-    with fitting(path):
-        if "learner" in state:
-            _check_learner(state, learner.state_dict())
-            learner.load_state_dict(state["learner"])
-        else:
-            networks = checkpoint.loss_state(state)
-            check_module(networks, learner.loss.state_dict())
-            learner.loss.load_state_dict(networks)
-        collapsed = (state.get("rollback") or {}).get("collapsed_at") is not None
-        if "collector" in state and not collapsed:
-            check_entries(state["collector"], {"buffer": {"transitions": {}, "writer": {}}}, "collector")
-            buffer = state["collector"]["buffer"]
-        trainer.collector.warm_start(buffer)
-    learner.check_parameters(0)
-    return path.absolute()
-
-
-def _check_learner(state: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
-    others = {name: entry for name, entry in expected.items() if name != "loss"}
-    check_entries(state, {"learner": others})
-    check_module(state["learner"]["loss"], expected["loss"])
-
-
-@contextmanager
-def fitting(path: Path) -> Iterator[None]:
-    """Turn the refusal of an argument, while a checkpoint is checked or loaded, into an error that names the file.
-
-    Raises:
-        CheckpointError: if the block raises an ArgumentError.
-    """
-    try:
-        yield
-    except ArgumentError as error:
-        raise CheckpointError(f"{path} does not fit the run's configuration: {error}") from error

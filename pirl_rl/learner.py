@@ -196,4 +196,4 @@ def _adam(params, rate: float) -> torch.optim.Adam:
 
 def _name(rule: object) -> str:
     """The full name of the class of a rule, by which a checkpoint records it."""
-    return f"{type(rule).__module__}.{type(rule).__qualname__}"
+    return type(rule).__qualname__

@@ -32,6 +32,15 @@ SIMULATOR = ("dt", "substeps", "crossing")
 RULE_DEFAULTS = {"actor_rule": "both", "model_steps": 1, "ppo_clip": 0.2}
 """Defaults of the arguments of the loss of format 1 that define the actor rule."""
 
+RULE_NAMES = {
+    "q": "Q",
+    "hamiltonian": "Hamiltonian",
+    "both": "Sum",
+    "model": "LookAhead",
+    "ppo": "ClippedSurrogate",
+}
+"""The class of each actor rule that format 1 names by a word."""
+
 LOSS_DROPPED = ("model_steps", "simulator", "exploration_noise", "ppo_clip")
 """Arguments of the loss of format 1 that are arguments of the actor rule in the current format."""
 
@@ -80,19 +89,14 @@ def _moved(value: Any) -> Any:
 
 def _actor_rule(rule: Mapping[str, Any]) -> NestedDict | Any:
     """The node of a rule that format 1 names by a word; another value is kept, and refused when it is built."""
-    q, hamiltonian = {"_target_": f"{RULES}.Q"}, {"_target_": f"{RULES}.Hamiltonian"}
-    nodes = {
-        "q": q,
-        "hamiltonian": hamiltonian,
-        "both": {"_target_": f"{RULES}.Sum", "rules": [q, hamiltonian]},
-        "model": {"_target_": f"{RULES}.LookAhead", "steps": rule["model_steps"]},
-        "ppo": {
-            "_target_": f"{RULES}.ClippedSurrogate",
-            "clip": rule["ppo_clip"],
-            "deviation": rule["exploration_noise"],
-        },
+    targets = {word: {"_target_": f"{RULES}.{name}"} for word, name in RULE_NAMES.items()}
+    arguments = {
+        "both": {"rules": [targets["q"], targets["hamiltonian"]]},
+        "model": {"steps": rule["model_steps"]},
+        "ppo": {"clip": rule["ppo_clip"], "deviation": rule["exploration_noise"]},
     }
-    return nodes.get(rule["actor_rule"], rule["actor_rule"])
+    word = rule["actor_rule"]
+    return {**targets[word], **arguments.get(word, {})} if word in targets else word
 
 
 def _stage(stage: NestedDict, run: Mapping[str, Any], stretch: float) -> NestedDict:

@@ -12,9 +12,10 @@ from pathlib import Path
 
 import torch
 
-from pirl_rl.assembly import make_trainer, restore
+from pirl_rl.assembly import make_trainer
 from pirl_rl.commands.composition import compose
 from pirl_rl.configuration import save_config
+from pirl_rl.continuation import restore
 from pirl_rl.simulator import Simulator
 from pirl_rl.trainer import Trainer
 

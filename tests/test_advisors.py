@@ -9,7 +9,8 @@ import pytest
 from omegaconf import OmegaConf
 from rounds import after, history, improves, plan, request
 
-from pirl_rl.configuration import CONF, build, parameters_of
+from pirl_rl.building import build, parameters_of
+from pirl_rl.configuration import CONF
 from pirl_rl.errors import AdvisorError, ConfigError, PlanError
 from pirl_rl.outer_loop.advisors.file import File
 from pirl_rl.outer_loop.advisors.greedy import Greedy

@@ -12,9 +12,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from rounds import BASE, QUIET, candidate, write_json
 from small import small_trainer
 
-from pirl_rl.assembly import start_from
 from pirl_rl.commands.baseline import measure
 from pirl_rl.commands.composition import compose
+from pirl_rl.continuation import start_from
 from pirl_rl.errors import ConfigError
 from pirl_rl.outer_loop.candidates import Task, make_job, quoted, read_result, settle, training_overrides
 from pirl_rl.outer_loop.history import Result

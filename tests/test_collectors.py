@@ -12,8 +12,8 @@ import torch
 from small import assert_same, small_trainer
 from tensordict import TensorDict
 
-from pirl_rl.assembly import restore
 from pirl_rl.collectors.transitions import TRANSITION, Exploration, Transitions
+from pirl_rl.continuation import restore
 from pirl_rl.errors import CollectorError
 from pirl_rl.problems.reach1d_env import Reach1DEnv
 

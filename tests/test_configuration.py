@@ -11,7 +11,8 @@ from small import small_config, small_trainer
 
 from pirl_rl import load_run
 from pirl_rl.assembly import make_trainer
-from pirl_rl.configuration import build, load_config, resolve
+from pirl_rl.building import build, resolve
+from pirl_rl.configuration import load_config
 from pirl_rl.errors import ConfigError
 from pirl_rl.problems import Reach1D
 from pirl_rl.run_directory import RunDirectory
@@ -44,7 +45,7 @@ def my_module(tmp_path, monkeypatch):
         "pirl_rl.collectors.os.system",
         "pirl_rl.train._new",
         "pirl_rl.checkpoint.save",
-        "pirl_rl.configuration.resolve",
+        "pirl_rl.building.resolve",
         "pirl_rl.problems.Reach1D.__init__",
         "pirl_rl.problems.Reach1D.__class__",
         "pirl_rl.problem",

@@ -11,8 +11,8 @@ from omegaconf import OmegaConf
 from small import QUICK
 
 from pirl_rl import train
+from pirl_rl.building import build
 from pirl_rl.commands.console import reported
-from pirl_rl.configuration import build
 from pirl_rl.errors import ArgumentError, ConfigError, PlanError
 from pirl_rl.problems import Reach1D
 

@@ -16,7 +16,7 @@ CONTRACTS = {
     contract["id"]: contract
     for contract in tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
 }
-LINE = "configuration"
+LINE = "building | configuration"
 """The lowest floor that knows OmegaConf."""
 
 

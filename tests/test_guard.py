@@ -11,8 +11,8 @@ import pytest
 import torch
 from small import assert_same, at_update, interrupt, resumed, small_trainer
 
-from pirl_rl.assembly import start_from
 from pirl_rl.checkpoint import load
+from pirl_rl.continuation import start_from
 from pirl_rl.errors import CollapseError, Interrupted
 from pirl_rl.guard import Guard
 from pirl_rl.run_directory import RunDirectory

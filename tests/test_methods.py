@@ -7,9 +7,10 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from pirl_rl.assembly import make_trainer
+from pirl_rl.building import parameters_of, resolve
 from pirl_rl.commands.composition import arguments, compose, drop_leftovers
 from pirl_rl.commands.methods import check_method, owned
-from pirl_rl.configuration import CONF, parameters_of, resolve
+from pirl_rl.configuration import CONF
 from pirl_rl.errors import ConfigError
 
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))

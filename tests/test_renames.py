@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from pirl_rl.configuration import load_config, resolve, save_config
+from pirl_rl.building import resolve
+from pirl_rl.configuration import load_config, save_config
 from pirl_rl.errors import ConfigError
 from pirl_rl.renames import MOVED, upgraded
 from pirl_rl.run_directory import FORMAT, RunDirectory

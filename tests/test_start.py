@@ -10,10 +10,10 @@ from small import QUICK, assert_same, at_update, interrupt, resumed, small_train
 from test_checkpoint import Payload
 
 from pirl_rl import checkpoint, train
-from pirl_rl.assembly import start_from
 from pirl_rl.checkpoint import load
 from pirl_rl.collectors.transitions import TRANSITION
 from pirl_rl.configuration import load_config
+from pirl_rl.continuation import start_from
 from pirl_rl.errors import CheckpointError, Interrupted
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.trainer import Trainer

@@ -17,7 +17,8 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
 
-from pirl_rl.configuration import CONF, parameters_of, resolve
+from pirl_rl.building import parameters_of, resolve
+from pirl_rl.configuration import CONF
 
 REFERENCE = re.compile(r"^\s*- /arguments/([\w.]+)@", re.MULTILINE)
 

@@ -15,11 +15,12 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from pirl_rl.assembly import make_trainer, restore, start_from
+from pirl_rl.assembly import make_trainer
 from pirl_rl.commands.composition import drop_leftovers, register
 from pirl_rl.commands.console import metrics_table, named_modules, override, quiet_libraries, reported
 from pirl_rl.commands.methods import check_method
 from pirl_rl.configuration import CONF, load_config, save_config
+from pirl_rl.continuation import restore, start_from
 from pirl_rl.errors import INTERRUPTED, ConfigError
 from pirl_rl.evaluation import meanings_of
 from pirl_rl.figures import draw_run

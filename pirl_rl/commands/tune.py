@@ -19,11 +19,13 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
-from pirl_rl.assembly import make_trainer, start_from
+from pirl_rl.assembly import make_trainer
+from pirl_rl.building import build, convert
 from pirl_rl.commands.baseline import measure
 from pirl_rl.commands.composition import compose, drop_leftovers, register
 from pirl_rl.commands.console import named_modules, quiet_libraries, reported
-from pirl_rl.configuration import CONF, build, convert
+from pirl_rl.configuration import CONF
+from pirl_rl.continuation import start_from
 from pirl_rl.errors import INTERRUPTED, ConfigError
 from pirl_rl.files import replacing
 from pirl_rl.outer_loop.candidates import LEADING, Task, quoted, training_overrides

@@ -12,9 +12,10 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from pirl_rl import checkpoint
-from pirl_rl.assembly import fitting, make_networks, make_problem, make_simulator
+from pirl_rl.assembly import make_networks, make_problem, make_simulator
 from pirl_rl.checkpoint import check_module
 from pirl_rl.configuration import load_config
+from pirl_rl.continuation import fitting
 from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.monte_carlo import Estimate, monte_carlo
 from pirl_rl.evaluation.trajectories import Trajectories, closed_loop

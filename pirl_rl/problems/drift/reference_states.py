@@ -57,7 +57,7 @@ class DriftStates:
         if self.run is None:
             return ReferenceStates.load(FILE)
         # Imported here, because opening a run builds its evaluators, which may use this class.
-        from pirl_rl.configuration import ConfigError
+        from pirl_rl.errors import ConfigError
         from pirl_rl.runs.load import load_run
 
         reference = load_run(self.run)
