@@ -125,4 +125,5 @@ def _evaluation(evaluation: NestedDict, env: Mapping[str, Any]) -> NestedDict:
         else value
         for name, value in evaluation.items()
     }
-    return {**new, "simulator": {name: f"${{env.{name}}}" for name in SIMULATOR if name in env}}
+    steps = {name: f"${{env.{name}}}" for name in SIMULATOR if name in env}
+    return {**new, "simulator": {"_target_": "pirl_rl.simulator.Simulator", **steps}}

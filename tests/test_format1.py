@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 import pirl_rl
+from pirl_rl.assembly import make_trainer
 from pirl_rl.configuration import load_config
 from pirl_rl.run_directory import RunDirectory
 
@@ -41,6 +42,15 @@ def test_only_what_is_read_is_brought_up_to_date(name):
     assert isinstance(written["loss"]["actor_rule"], str)
     rule = {"reach1d": "Hamiltonian", "drift": "LookAhead"}[name]
     assert load_config(FOLDERS[name]).loss.actor_rule._target_ == f"pirl_rl.actor_rules.{rule}"
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_the_whole_configuration_builds(name):
+    """The trainer with its evaluators and stages, so that a run of the first format can be resumed."""
+    trainer = make_trainer(load_config(FOLDERS[name]))
+    assert trainer.simulator.problem is trainer.solution.problem
+    assert [stage.share for stage in trainer.curriculum.stages] == {"reach1d": [1.0], "drift": [8, 4, 5]}[name]
+    assert {"success", "residuals", "calibration"} <= trainer.final.keys()
 
 
 def test_a_new_run_starts_from_networks_of_the_first_format(tmp_path):

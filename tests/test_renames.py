@@ -69,7 +69,8 @@ def test_the_model_of_the_drifting_car():
     assert second["actor_rule"] == {"_target_": f"{RULES}.ClippedSurrogate", "clip": 0.2, "deviation": 0.1}
     assert third == {"share": 5, "train_actor": False, "n_steps": 50, "learning_rate": 0.001}
     assert first["initial_states"]["_target_"] == "pirl_rl.problems.drift.starts.EquilibriumStates"
-    assert new["evaluation"]["simulator"] == {name: f"${{env.{name}}}" for name in ("dt", "substeps", "crossing")}
+    steps = {name: f"${{env.{name}}}" for name in ("dt", "substeps", "crossing")}
+    assert new["evaluation"]["simulator"] == {"_target_": "pirl_rl.simulator.Simulator", **steps}
     assert new["schedule"]["initial"] == [1, 0.1, 1]
 
 
