@@ -125,3 +125,16 @@ def restore_rng(rng: torch.Generator, state: torch.Tensor) -> None:
         rng.set_state(state)
     else:
         rng.manual_seed(zlib.crc32(state.numpy().tobytes()))
+
+
+def global_rng_states() -> dict[str, Any]:
+    """The states of torch's global random generators, of the CPU and of all CUDA devices."""
+    cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
+    return {"torch_rng": torch.get_rng_state(), "cuda_rng": cuda}
+
+
+def restore_global_rngs(state: Mapping[str, Any]) -> None:
+    """Restore what `global_rng_states` returned; those of CUDA only on a machine with as many devices."""
+    torch.set_rng_state(state["torch_rng"])
+    if len(state["cuda_rng"]) == torch.cuda.device_count():
+        torch.cuda.set_rng_state_all(state["cuda_rng"])

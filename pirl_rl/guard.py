@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -133,10 +134,21 @@ class Rollback:
             # The optimisers are kept too, because their moments after a collapse would harm further training.
             self.good, self.good_at = copy.deepcopy(self.learner.state_dict()), update
 
-    def restore(self, update: int) -> None:
-        """Restore the state that was kept, after a collapse that was detected at an update."""
+    def restore(self, update: int, reason: str) -> None:
+        """Restore the state that was kept, and say so.
+
+        Args:
+            update: the number of updates after which the collapse was detected.
+            reason: what collapsed.
+        """
         self.learner.load_state_dict(self.good)
         self.collapsed_at = update
+        print(
+            f"training collapsed at update {update}: {reason}; the networks of update {self.good_at} are restored, and "
+            "the run ends with them",
+            file=sys.stderr,
+            flush=True,
+        )
 
     def summary(self) -> dict[str, int]:
         """The updates of the collapse and of the state that was restored; empty without a collapse."""

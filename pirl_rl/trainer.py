@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
+from torch import Tensor
 
 from pirl_rl import checkpoint
 from pirl_rl.collectors import TransitionCollector
@@ -161,17 +160,8 @@ class Trainer:
             except DivergenceError as error:
                 if self.rollback is None:
                     raise
-                self._roll_back(self.rollback, str(error))
-
-    def _roll_back(self, rollback: Rollback, reason: str) -> None:
-        rollback.restore(self.update)
-        self.save()
-        print(
-            f"training collapsed at update {self.update}: {reason}; the networks of update {rollback.good_at} are "
-            "back, and the run ends with them",
-            file=sys.stderr,
-            flush=True,
-        )
+                self.rollback.restore(self.update, str(error))
+                self.save()
 
     def _loop(self, interrupted: Callable[[], bool]) -> None:
         started = time.perf_counter() - self.wall_seconds
@@ -204,7 +194,7 @@ class Trainer:
         self.batches.collocation = settings.collocation
         self.learner.apply(settings)
 
-    def _row(self, k: int, terms: Mapping[str, torch.Tensor]) -> dict[str, float]:
+    def _row(self, k: int, terms: Mapping[str, Tensor]) -> dict[str, float]:
         """The metrics of an update, on those that log; empty on others."""
         evaluates = bool(self.evaluate_every) and (k == 0 or self.update % self.evaluate_every == 0)
         if not (k == 0 or evaluates or self.update % self.log_every == 0):
@@ -258,8 +248,7 @@ class Trainer:
             "collector": self.collector.state_dict(),
             "rollback": None if self.rollback is None else self.rollback.state_dict(),
             "rng": self.batches.rng.get_state(),
-            "torch_rng": torch.get_rng_state(),
-            "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+            **checkpoint.global_rng_states(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -270,6 +259,4 @@ class Trainer:
         if self.rollback is not None and state.get("rollback") is not None:
             self.rollback.load_state_dict(state["rollback"])
         checkpoint.restore_rng(self.batches.rng, state["rng"])
-        torch.set_rng_state(state["torch_rng"])
-        if len(state["cuda_rng"]) == torch.cuda.device_count():
-            torch.cuda.set_rng_state_all(state["cuda_rng"])
+        checkpoint.restore_global_rngs(state)

@@ -155,7 +155,7 @@ def test_a_collapse_ends_with_the_last_good_networks(harm, tmp_path, capfd):
     assert json.loads((tmp_path / "summary.json").read_text()) == summary
     [line] = [line for line in capfd.readouterr().err.splitlines() if "collapsed" in line]
     assert f"collapsed at update {summary['collapsed_at']}" in line
-    assert "update 30 are back" in line
+    assert "update 30 are restored" in line
     again = resumed(tmp_path, *GUARDED, SOUND)
     assert_same(networks(again), good)
     assert again.train() == pytest.approx(summary)

@@ -45,7 +45,7 @@ def metrics_table(summary: Mapping[str, float], meanings: Mapping[str, str]) -> 
 
 
 def named_modules(overrides: Sequence[str]) -> list[str]:
-    """The modules of all `_target_`s among the overrides."""
+    """The modules that the overrides name by a `_target_`."""
     targets = [value for key, _, value in (item.partition("=") for item in overrides) if key.endswith("_target_")]
     return [target.partition(".")[0] for target in targets]
 
