@@ -7,10 +7,11 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from pirl_rl.assembly import make_trainer
-from pirl_rl.building import parameters_of, resolve
+from pirl_rl.building import build, parameters_of, resolve
 from pirl_rl.commands.composition import arguments, compose, drop_leftovers
 from pirl_rl.commands.methods import check_method, owned
 from pirl_rl.configuration import CONF
+from pirl_rl.curriculum import Curriculum, Stage
 from pirl_rl.errors import ConfigError
 
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
@@ -83,6 +84,23 @@ def test_td3_on_the_paper_s_drifting_has_td3_s_stages_alone():
     config = composed("drift_paper", "method=td3")
     assert [stage.share for stage in config.stages] == [1, 4]
     assert len(composed("drift_paper").stages) == 8
+
+
+@pytest.mark.parametrize("updates", [15_000_000, 1_500])
+def test_the_paper_s_drifting_adds_the_physics_after_a_third_of_the_run(updates):
+    """Facts of the paper: weights (1, 0, 0) to 5e6 updates, then 0.001 at 6e6, 0.002 at 7e6 and 8e6, 0.0015 from 10e6.
+
+    A sigmoid is off its ends by exp(-5), that is by 7e-6 for steps of 0.001.
+    """
+    config = composed("drift_paper", f"trainer.updates={updates}")
+    stages = [
+        Stage(stage.share, build(stage.schedule, "s") if "schedule" in stage else None) for stage in config.stages
+    ]
+    curriculum = Curriculum(build(config.schedule, "schedule"), updates, stages)
+    for share, weight in ((0, 0), (4.9, 0), (5.99, 1e-3), (6.99, 2e-3), (7.99, 2e-3), (8.99, 1.5e-3), (14.9, 1.5e-3)):
+        td, hjb, boundary = curriculum.weights(int(share / 15 * updates))
+        assert (td, hjb) == (1, boundary)
+        assert hjb == pytest.approx(weight, abs=1e-5)
 
 
 def test_an_experiment_that_changes_a_method_in_silence_is_refused():
