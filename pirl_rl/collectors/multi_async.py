@@ -66,6 +66,7 @@ class MultiAsyncCollector:
         self._env, self._workers, self._random_warmup = env, workers, True
         self._frames_per_batch, self._transitions = frames_per_batch, Transitions(n_steps)
         self._collector: Any = None
+        self._weights: Any = None
         self._write_lock = write_lock(self.buffer)
         storage: Any = self.buffer.storage
         weakref.finalize(self, shutil.rmtree, storage.scratch_dir, ignore_errors=True)
@@ -111,6 +112,7 @@ class MultiAsyncCollector:
         # process watches the workers.
         self.buffer.set_rng(None)
         lock_writes_with(self.buffer, self._write_lock)
+        self._weights = SharedMemWeightSyncScheme(sync=False)  # type: ignore[call-arg]
         try:
             self._collector = torchrl_collectors.MultiAsyncCollector(
                 [partial(_worker_env, recipe, os.getpid()) for recipe in recipes],
@@ -121,7 +123,7 @@ class MultiAsyncCollector:
                 replay_buffer=self.buffer,
                 postproc=self._transitions,
                 auto_register_policy_transforms=False,
-                weight_sync_schemes={"policy": SharedMemWeightSyncScheme(sync=False)},  # type: ignore[call-arg]
+                weight_sync_schemes={"policy": self._weights},
             )
         except RuntimeError as error:
             raise CollectorError(
@@ -145,6 +147,8 @@ class MultiAsyncCollector:
     def close(self) -> None:
         if self._collector is not None:
             self._collector.async_shutdown()
+            # Otherwise its destructor starts a thread, which hangs if the interpreter is about to end.
+            self._weights.shutdown()
 
     def state_dict(self) -> dict[str, Any]:
         return {"buffer": buffer_state(self.buffer, self._rng), "exploration_noise": self.exploration_noise}
