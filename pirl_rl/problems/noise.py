@@ -1,0 +1,21 @@
+"""Constant noise of independent coordinates, the diffusion of several problems."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import Tensor
+
+
+def independent_noise(x: Tensor, strengths: Sequence[float]) -> Tensor:
+    """sigma (*, n, w) at states (*, n): each coordinate whose strength is not 0 has a noise channel of its own.
+
+    Args:
+        x: states (*, n), which give the shape, the dtype and the device.
+        strengths: n numbers, in units of the coordinate per sqrt(s).
+    """
+    channels = [axis for axis, strength in enumerate(strengths) if strength]
+    columns = x.new_zeros(len(strengths), len(channels))
+    for channel, axis in enumerate(channels):
+        columns[axis, channel] = strengths[axis]
+    return columns.expand(*x.shape[:-1], *columns.shape)
