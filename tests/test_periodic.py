@@ -173,6 +173,8 @@ def test_noise_free_flow_stays_in_the_period():
     free = Simulator(FullNoise(3, 2, 2), 0.3, 3).flow(x, torch.ones(200, 2, dtype=x.dtype))
     torch.testing.assert_close(moved, problem.states.wrap(free), rtol=1e-12, atol=1e-12)
     assert ((free - moved)[:, 1].abs() > 1).any()
+    whole = torch.compile(Simulator(problem, 0.3, 3).flow, backend="eager", fullgraph=True)
+    assert torch.equal(whole(x, torch.ones(200, 2, dtype=x.dtype)), moved)
 
 
 def test_exit_of_an_arc_has_the_exact_probability():
@@ -222,7 +224,7 @@ def test_a_run_answers_outside_the_period_as_inside(tmp_path):
 
 @pytest.mark.slow
 def test_a_short_training_learns_the_exit_of_an_arc(tmp_path):
-    """Measured: mean square error 6e-4 outside the arc; without a periodic input the ends of the period cannot agree."""
+    """Measured: mean square error 6e-4 outside the arc; without a periodic input the ends of a period would differ."""
     run = pirl_rl.train(Circle(), folder=tmp_path / "run", updates=2000, compile=False, evaluation={"final": ["exact"]})
     x = torch.linspace(0.5, 3.5, 301, dtype=torch.float64).unsqueeze(-1)
     tau = torch.full((301,), 2.0, dtype=torch.float64)
