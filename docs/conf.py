@@ -74,7 +74,7 @@ reference_rooms = {
         ],
     ),
     "numerics": ("Simulator and operators", ["pirl_rl.simulator", "pirl_rl.operators", "pirl_rl.internals"]),
-    "networks": ("Networks and schedules", ["pirl_rl.networks", "pirl_rl.schedules"]),
+    "networks": ("Networks and schedules", ["pirl_rl.networks", "pirl_rl.layers", "pirl_rl.schedules"]),
     "sampling": (
         "States and points",
         ["pirl_rl.sampling.initial_states", "pirl_rl.sampling.collocation", "pirl_rl.sampling.boundary"],

@@ -100,6 +100,7 @@ class ReachAvoidEnv(EnvBase):
         steps, state = self.initial_states.sample(
             self.problem, self.batch_size[0], self.max_steps, self.rng, torch.get_default_dtype(), visited
         )
+        state = self.problem.states.wrap(state)
         none = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
         return TensorDict(
             {

@@ -10,7 +10,8 @@ How an exit within a sub-step is detected is the rule `crossing`:
   Processes and their Applications 87, 2000). A face of a target with corners counts only if all other constraints of
   the target hold at both ends.
 
-A path that both reaches A and enters B within one sub-step counts as a failure.
+A path that both reaches A and enters B within one sub-step counts as a failure. Periodic coordinates are brought back
+into their period at the end of each sub-step, before levels are taken there.
 """
 
 from __future__ import annotations
@@ -102,7 +103,7 @@ class Simulator:
     def flow(self, x: Tensor, u: Tensor) -> Tensor:
         """States (N, n) after a control step without noise and exits; differentiable in x (N, n) and u (N, m)."""
         for _ in range(self.substeps):
-            x = x + self.problem.drift(x, u) * (self.dt / self.substeps)
+            x = self.problem.states.wrap(x + self.problem.drift(x, u) * (self.dt / self.substeps))
         return x
 
     def _euler_maruyama(self, x: Tensor, u: Tensor, h: Tensor, rng) -> tuple[Tensor, Tensor]:
@@ -114,7 +115,7 @@ class Simulator:
             moved = (sigma[(0,) * (sigma.ndim - 2)] @ noise).mT
         else:
             moved = (sigma * noise.movedim(0, -1).unsqueeze(-2)).sum(-1)
-        return x + self.problem.drift(x, u) * h[..., None] + moved, sigma
+        return self.problem.states.wrap(x + self.problem.drift(x, u) * h[..., None] + moved), sigma
 
     def _exits(self, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor, rng) -> tuple[Tensor, Tensor]:
         problem = self.problem

@@ -112,7 +112,7 @@ def monte_carlo(
     simulator, times = Simulator(problem, dt, substeps, crossing), times.expand(len(points))
     rng = torch.Generator(points.device).manual_seed(seed)
     mean = mean_payoff(simulator, policy, times, points, rollouts, rng)
-    known = _known(problem, times, points)[0]
+    known = _known(problem, times, problem.states.wrap(points))[0]
     low, high = (torch.where(known, mean, end) for end in wilson_interval(mean * rollouts, rollouts, confidence))
     if isinstance(x, Tensor):
         return Estimate(*(entry.to(points.dtype) for entry in (mean, low, high)), rollouts=rollouts)
@@ -124,6 +124,7 @@ def mean_payoff(
     simulator: Simulator, policy: Policy, tau: Tensor, x: Tensor, rollouts: int, rng: torch.Generator
 ) -> Tensor:
     """Mean payoff (N,), float64, of paths from tau (N,) and x (N, n); the arguments are those of `monte_carlo`."""
+    x = simulator.problem.states.wrap(x)
     known, value = _known(simulator.problem, tau, x)
     steps = torch.ceil(tau.double() / simulator.dt - STEP_TOLERANCE).clamp(min=1).long()
     total, unknown = torch.zeros_like(tau, dtype=torch.float64), (~known).nonzero().squeeze(-1)

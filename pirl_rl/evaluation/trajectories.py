@@ -39,10 +39,11 @@ def closed_loop(simulator: Simulator, policy: Policy, tau: Tensor, x: Tensor, rn
         simulator: plays the steps.
         policy: maps tau (N,) and x (N, n) to the control (N, m) in SI units.
         tau: times to go (N,) in s, rounded to whole control steps.
-        x: initial states (N, n) in SI units.
+        x: initial states (N, n) in SI units; the path starts with their periodic coordinates in [low, high).
         rng: draws the noise.
     """
     problem, left = simulator.problem, torch.round(tau.double() / simulator.dt).long()
+    x = problem.states.wrap(x)
     reached, failed, steps = problem.reached(x), problem.failed(x), torch.zeros_like(left)
     times, states = [tau], [x]
     for _ in range(int(left.max())):
