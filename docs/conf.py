@@ -122,6 +122,7 @@ reference_rooms = {
             "pirl_rl.evaluation.inputs",
             "pirl_rl.evaluation.exact_error",
             "pirl_rl.evaluation.residuals",
+            "pirl_rl.evaluation.largest_residual",
             "pirl_rl.evaluation.success",
             "pirl_rl.evaluation.calibration",
             "pirl_rl.evaluation.accuracy",
