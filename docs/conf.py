@@ -73,7 +73,10 @@ reference_rooms = {
             "pirl_rl.problems.drift.reference_states",
         ],
     ),
-    "numerics": ("Simulator and operators", ["pirl_rl.simulator", "pirl_rl.operators", "pirl_rl.internals"]),
+    "numerics": (
+        "Simulator and operators",
+        ["pirl_rl.simulator", "pirl_rl.clock", "pirl_rl.operators", "pirl_rl.internals"],
+    ),
     "networks": ("Networks and schedules", ["pirl_rl.networks", "pirl_rl.layers", "pirl_rl.schedules"]),
     "sampling": (
         "States and points",

@@ -17,11 +17,13 @@ into their period at the end of each sub-step, before levels are taken there.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
+from pirl_rl.clock import Clock
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
 
@@ -73,6 +75,11 @@ class Simulator:
         if self.crossing not in ("bridge", "endpoint"):
             raise ArgumentError(f"crossing: expected 'bridge' or 'endpoint', got {self.crossing!r}")
 
+    @cached_property
+    def clock(self) -> Clock:
+        """Counts the control steps of the problem's horizon."""
+        return Clock(self.dt, self.problem.horizon)
+
     @torch.no_grad()
     def step(self, x: Tensor, u: Tensor, rng: torch.Generator | None = None, dt: Tensor | None = None) -> Step:
         """Advance paths that are outside A and B by one control step.
@@ -100,10 +107,17 @@ class Simulator:
             reached = reached | (active & now_reached & ~now_failed)
         return Step(x, reached, failed)
 
-    def flow(self, x: Tensor, u: Tensor) -> Tensor:
-        """States (N, n) after a control step without noise and exits; differentiable in x (N, n) and u (N, m)."""
+    def flow(self, x: Tensor, u: Tensor, dt: Tensor | None = None) -> Tensor:
+        """States (N, n) after a control step without noise and exits; differentiable in x (N, n) and u (N, m).
+
+        Args:
+            x: states (N, n).
+            u: physical controls (N, m).
+            dt: the length of the step for each state (N,), in s; default `self.dt` for all.
+        """
+        h = self.dt / self.substeps if dt is None else (dt / self.substeps).to(x)[..., None]
         for _ in range(self.substeps):
-            x = self.problem.states.wrap(x + self.problem.drift(x, u) * (self.dt / self.substeps))
+            x = self.problem.states.wrap(x + self.problem.drift(x, u) * h)
         return x
 
     def _euler_maruyama(self, x: Tensor, u: Tensor, h: Tensor, rng) -> tuple[Tensor, Tensor]:

@@ -108,10 +108,11 @@ class Residuals:
 
     def _td(self, solution: Solution, simulator: Simulator, rng: torch.Generator) -> Tensor:
         problem = solution.problem
-        max_steps = round(problem.horizon / simulator.dt)
-        steps, x = UniformStates().sample(problem, self.points, max_steps, rng, solution.dtype)
-        tau, tau_next, x = like(solution, steps * simulator.dt, (steps - 1) * simulator.dt, x)
-        step = simulator.step(x, solution.policy(tau, x), noise_rng(solution, self.seed))
+        clock = simulator.clock
+        steps, x = UniformStates().sample(problem, self.points, clock.max_steps, rng, solution.dtype)
+        tau, tau_next, x = like(solution, clock.time(steps), clock.time(steps - 1), x)
+        h = clock.length(steps, clock.shortfall).to(x)
+        step = simulator.step(x, solution.policy(tau, x), noise_rng(solution, self.seed), dt=h)
         ended = step.reached | step.failed | (steps == 1).to(solution.device)
         target = torch.where(ended, exit_value(problem, step), solution.raw_value(tau_next, step.state))
         return solution.raw_value(tau, x) - target
