@@ -89,6 +89,7 @@ reference_rooms = {
             "pirl_rl.actor_rules.q",
             "pirl_rl.actor_rules.hamiltonian",
             "pirl_rl.actor_rules.look_ahead",
+            "pirl_rl.actor_rules.best_control",
             "pirl_rl.actor_rules.clipped_surrogate",
             "pirl_rl.actor_rules.sum",
         ],

@@ -97,12 +97,13 @@ def make_trainer(
         warnings.filterwarnings("ignore", message="No target network updater")
         # The networks were moved to their device before, so that the loss shares their buffers.
         loss = build(config.loss, "loss", trust, parts, problem=problem, actor=actor, critics=critics).to(device)
+    actor, learned = loss.actor_network.module, parts | {"solution": loss.solution()}
     return build(
         config.trainer,
         "trainer",
         trust,
         learner=build(config.learner, "learner", trust, loss=loss),
-        collector=build(config.collector, "collector", trust, env=env, actor=loss.actor_network.module, seed=sampling),
+        collector=build(config.collector, "collector", trust, learned, env=env, actor=actor, seed=sampling),
         collocation=build(config.collocation, "collocation", trust, parts),
         boundary=build(config.boundary, "boundary", trust, parts),
         schedule=build(config.schedule, "schedule", trust),

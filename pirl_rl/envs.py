@@ -6,6 +6,7 @@ A TensorDict contains a batch of N paths:
   which is shorter where dt does not divide tau and ends at tau = 0;
 - "state" (N, n): the state x, in SI units;
 - "action" (N, m): the control, normalised to [-1, 1];
+- "noise" (N, n): sigma dW of the last control step, in the units of the state, see `Step.noise`;
 - "is_init" (N, 1): whether the state is the first of its episode;
 - "reward" (N, 1): l_eps at the last state of an episode, else 0.
 
@@ -85,6 +86,7 @@ class ReachAvoidEnv(EnvBase):
         self.observation_spec = Composite(
             tau=Bounded(0.0, problem.horizon, one, device=device),
             state=Unbounded(n, device=device),
+            noise=Unbounded(n, device=device),
             is_init=Categorical(2, one, dtype=torch.bool, device=device),
             shape=bs,
             device=device,
@@ -107,6 +109,7 @@ class ReachAvoidEnv(EnvBase):
             {
                 "tau": self.simulator.clock.time(steps).to(state.dtype).unsqueeze(-1),
                 "state": state,
+                "noise": torch.zeros_like(state),
                 "is_init": ~none,
                 "done": none,
                 "terminated": none.clone(),
@@ -125,6 +128,7 @@ class ReachAvoidEnv(EnvBase):
             {
                 "tau": clock.time(steps - 1, shortfall).to(tau),
                 "state": step.state,
+                "noise": step.noise,
                 "is_init": torch.zeros_like(terminated),
                 "reward": exit_value(self.problem, step).unsqueeze(-1) * terminated,
                 "done": terminated,

@@ -71,13 +71,12 @@ class Solution:
         u = self.problem.controls.denormalize(action) if u is None else u
         return generator(self.critic.at(action), self.problem, tau, x, u).mean(0)
 
+    @torch.no_grad()
     def gradient(self, tau: Tensor, x: Tensor) -> Tensor:
         """The gradient of `raw_value` in x (N, n), per unit of the state; the action of the critics is frozen."""
         tau, x = self._own(tau, x)
-        action = self._action(tau, x).detach()
-        x = x.detach().requires_grad_()
-        value = self.critic.at(action)(tau, x).mean(0)
-        return torch.autograd.grad(value.sum(), x)[0]
+        value = self.critic.at(self._action(tau, x))
+        return torch.func.grad(lambda y: value(tau, y).mean(0).sum())(x)
 
     @torch.no_grad()
     def hessian(self, tau: Tensor, x: Tensor) -> Tensor:

@@ -12,18 +12,17 @@ n x w matrices at every point.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
+from pirl_rl.ascent import ascend, hamiltonian, replaced
 from pirl_rl.problem import has_controlled_noise
 from pirl_rl.solution import Solution
 
 EXHAUSTIVE = 25
 """The largest number of controls of which every one is tried."""
 
-SWEEPS = 10
+SWEEPS = 3
 """How often the ascent passes through all controls at most."""
 
 CHUNK = 2**24
@@ -56,51 +55,11 @@ def largest_residual(solution: Solution, tau: Tensor, x: Tensor, along: Tensor, 
 
 def _largest_gain(solution: Solution, tau: Tensor, x: Tensor, axis: Tensor, curved: bool) -> Tensor:
     """The maximum of L^u V - L^pi V (N,) that the ascent finds on the levels `axis`."""
-    box = solution.problem.controls
-    action = box.normalize(solution.policy(tau, x))
-    gain = _gain(solution, tau, x, curved)
-    bounds = [torch.stack([gain(_with(action, i, bound)) for bound in (-1, 1)]) for i in range(box.dim)]
+    action = solution.problem.controls.normalize(solution.policy(tau, x))
+    objective = hamiltonian(solution, tau, x, curved)
+    bounds = [
+        torch.stack([objective(replaced(action, i, bound)) for bound in (-1.0, 1.0)]) for i in range(action.shape[-1])
+    ]
     vertex = torch.stack([pair.argmax(0) for pair in bounds], -1).to(x) * 2 - 1
-    return torch.maximum(*(_ascent(gain, start, axis) for start in (action, vertex)))
-
-
-def _gain(solution: Solution, tau: Tensor, x: Tensor, curved: bool) -> Callable[[Tensor], Tensor]:
-    """L^u V - L^pi V (N,) as a function of the action (N, m); the derivatives of V are computed once, for all actions.
-
-    It is the difference of f . grad V, and of 1/2 Tr(sigma^T hess V sigma) if sigma depends on u (`curved`).
-    """
-    problem, slope = solution.problem, solution.gradient(tau, x)
-    curvature = solution.hessian(tau, x) if curved else None
-
-    def hamiltonian(u: Tensor) -> Tensor:
-        value = (problem.drift(x, u) * slope).sum(-1)
-        if curvature is None:
-            return value
-        sigma = problem.diffusion(x, u)
-        return value + (sigma * (curvature @ sigma)).sum((-2, -1)) / 2
-
-    own = hamiltonian(solution.policy(tau, x))
-    return lambda action: hamiltonian(problem.controls.denormalize(action)) - own
-
-
-def _ascent(gain: Callable[[Tensor], Tensor], action: Tensor, axis: Tensor) -> Tensor:
-    """The gain (N,) after ascent from the action (N, m), one coordinate after the other on the levels `axis`."""
-    best = gain(action)
-    for _ in range(SWEEPS):
-        before = best
-        for i in range(action.shape[-1]):
-            for level in axis:
-                trial = _with(action, i, level)
-                value = gain(trial)
-                better = value > best
-                best, action = torch.where(better, value, best), torch.where(better.unsqueeze(-1), trial, action)
-        if torch.equal(best, before):
-            break
-    return best
-
-
-def _with(action: Tensor, column: int, level: Tensor | float) -> Tensor:
-    """The action (N, m) with one coordinate replaced by a number."""
-    changed = action.clone()
-    changed[:, column] = level
-    return changed
+    best = torch.maximum(*(ascend(objective, start, axis, SWEEPS)[1] for start in (action, vertex)))
+    return best - objective(action)

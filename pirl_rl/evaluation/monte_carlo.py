@@ -135,7 +135,7 @@ def mean_payoff(
 def _known(problem: ReachAvoidProblem, tau: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
     """A mask (N,) of the points whose value needs no simulation, and their value (N,)."""
     on_boundary, reached = ~problem.interior(x) | (tau <= 0), problem.reached(x)
-    value = exit_value(problem, Step(x, reached & ~problem.failed(x), problem.failed(x)))
+    value = exit_value(problem, Step(x, reached & ~problem.failed(x), problem.failed(x), torch.zeros_like(x)))
     return on_boundary | problem.unreachable(x), value * on_boundary
 
 
