@@ -74,8 +74,15 @@ reference_rooms = {
         ],
     ),
     "numerics": (
-        "Simulator and operators",
-        ["pirl_rl.simulator", "pirl_rl.clock", "pirl_rl.operators", "pirl_rl.internals"],
+        "Simulator, time steps and operators",
+        [
+            "pirl_rl.simulator",
+            "pirl_rl.clock",
+            "pirl_rl.time_steps",
+            "pirl_rl.rates",
+            "pirl_rl.operators",
+            "pirl_rl.internals",
+        ],
     ),
     "networks": ("Networks and schedules", ["pirl_rl.networks", "pirl_rl.layers", "pirl_rl.schedules"]),
     "sampling": (
