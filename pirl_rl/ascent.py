@@ -4,10 +4,10 @@ The Hamiltonian of V is the part of L^u V, Eq. (parabolic_operator), that depend
 
     H(u) = f(x, u) . grad V,   plus 1/2 Tr(sigma sigma^T hess V) where sigma depends on u.
 
-V is differentiated once for a state, and each control that is tried costs one evaluation of the physics. The ascent gives one
-coordinate of the control after the other its best level while the rest stand still. It finds the maximum over the levels
-if H is a sum of functions of one coordinate each, as for a drift that is affine in u and a sigma without u, where the
-maximum is a vertex of the box of controls. Unlike steps along a gradient in u, it leaves a local maximum.
+V is differentiated once for a state, and each control that is tried costs one evaluation of the physics. The ascent
+gives one coordinate of the control after the other its best level while the rest stand still. It finds the maximum over
+the levels if H is a sum of functions of one coordinate each, as for a drift that is affine in u and a sigma without u,
+where the maximum is a vertex of the box of controls. Unlike steps along a gradient in u, it leaves a local maximum.
 """
 
 from __future__ import annotations

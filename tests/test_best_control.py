@@ -115,5 +115,5 @@ def test_masked_points_do_not_count():
 def test_what_the_rule_refuses():
     with pytest.raises(ArgumentError, match=r"actor_rule.levels: expected at least 2, got 1"):
         BestControl(Reach1D(), levels=1)
-    with pytest.raises(ArgumentError, match="expected critic.action_input=false"):
+    with pytest.raises(ArgumentError, match=r"expected critic\.action_input=false"):
         BestControl(Reach1D()).check(Critic(Reach1D(), action_input=True))

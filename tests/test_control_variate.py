@@ -39,7 +39,7 @@ def exact_slope(problem: Reach1D):
 
 
 def returns(slope, seed: int = 0) -> Tensor:
-    """Returns (PATHS,) of whole episodes from `START` under the optimal control, with a slope for the control variate."""
+    """Returns (PATHS,) of whole episodes from `START` under the optimal control, with a slope of V if there is one."""
     problem = Reach1D()
     env = ReachAvoidEnv(problem, START[0] / STEPS, initial_states=StartAt(), num_envs=PATHS, seed=seed)
     modules = [TensorDictModule(lambda x: torch.ones_like(x), in_keys=["state"], out_keys=["action"])]

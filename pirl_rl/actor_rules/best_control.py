@@ -21,9 +21,9 @@ class BestControl(ActorRule):
     The points are the collocation points; if the weight of the HJB residual is 0, those of the transitions. a is the
     best action of the Hamiltonian, see `pirl_rl.ascent`, pi the actor's output, and CE the cross-entropy. The weight
     w_i is the range of the Hamiltonian in coordinate i, so that states at which the control hardly matters hardly
-    count, and T is the horizon. The gradient in the actor's outputs before their tanh is w_i (pi_i - a_i), which does not
-    vanish where the tanh is saturated at the wrong bound: unlike a gradient of the Hamiltonian in u, the rule corrects
-    such an action.
+    count, and T is the horizon. The gradient in the output before the tanh is T w_i (pi_i - a_i), which does not
+    vanish where the tanh is saturated at the wrong bound: unlike a gradient of the Hamiltonian in u, the rule
+    corrects such an action.
 
     Args:
         problem: the physics.

@@ -35,7 +35,8 @@ class MultiAsyncCollector:
         workers: the number of processes.
         frames_per_batch: transitions that a worker delivers at once, a multiple of the environment's batch size.
         updates_per_batch: updates between two copies of the actor.
-        warmup_frames, buffer_size, exploration_noise, exploration, n_steps, control_variate, seed: arguments of `SyncCollector`.
+        warmup_frames, buffer_size, exploration_noise, exploration, n_steps, control_variate, seed: arguments of
+            `SyncCollector`.
         patience: seconds without a new transition after which `CollectorError` is raised; for a worker that died it is
             raised at once.
 

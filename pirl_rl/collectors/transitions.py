@@ -4,15 +4,15 @@ With `control_variate`, the noise of the physics is taken out of the returns. Ov
 
     y = sum_k r_k + (1 - d) V(tau_n, x_n) - sum_k grad V(tau_k, x_k) . (sigma dW)_k         Eq. (control_variate)
 
-has the same mean as without the last sum, whatever V is, because the increment of the Brownian motion in a step has mean
-zero and is independent of all that came before. Where V is exact, Ito's formula says that the last sum is the deviation
-of the return from its mean, up to the size of a step. So the returns become more certain while V is learned. The cost
-is one gradient of V at each step, for any number of noise channels.
+has the same mean as without the last sum, whatever V is, because the increment of the Brownian motion in a step has
+mean zero and is independent of all that came before. Where V is exact, Ito's formula says that the last sum is the
+deviation of the return from its mean, up to the size of a step. So the returns become more certain while V is learned.
+The cost is one gradient of V at each step, for any number of noise channels.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -66,7 +66,7 @@ class ControlVariate(nn.Module):
         self.critic = solution.critic
 
     def forward(self, tau: Tensor, state: Tensor, action: Tensor) -> Tensor:
-        """The slope (N, n), per unit of the state, of V at tau (N, 1) and state (N, n) with the action (N, m) frozen."""
+        """The slope (N, n) of V, per unit of the state, at tau (N, 1) and state (N, n), at a frozen action (N, m)."""
         value = self.critic.at(action)
         return torch.func.grad(lambda x: value(tau.squeeze(-1), x).mean(0).sum())(state)
 
@@ -75,7 +75,7 @@ def exploring_policy(
     actor: nn.Module, exploration: Exploration, control_variate: nn.Module | None = None
 ) -> TensorDictSequential:
     """The actor followed by the noise and, if there is one, the control variate, as a policy for collectors."""
-    modules = [
+    modules: list[Any] = [
         TensorDictModule(actor, in_keys=["tau", "state"], out_keys=["loc"]),
         TensorDictModule(exploration, in_keys=["loc", "is_init"], out_keys=["action"]),
     ]
