@@ -18,9 +18,13 @@ from pirl_rl.envs import ReachAvoidEnv
 from pirl_rl.errors import ConfigError
 from pirl_rl.evaluation import Evaluator
 from pirl_rl.networks import Actor, Critic
-from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.problem import ReachAvoidProblem, check_problem
 from pirl_rl.simulator import Simulator
+from pirl_rl.time_steps import propose_time_steps
 from pirl_rl.trainer import Trainer
+
+AUTO = "auto"
+"""The value of env.dt and env.substeps that leaves the choice to `propose_time_steps`."""
 
 
 def pick_device(name: str) -> torch.device:
@@ -73,7 +77,7 @@ def make_trainer(
     """Build the trainer of a configuration with all its parts; nothing is written yet.
 
     Args:
-        config: the configuration of a run.
+        config: the configuration of a run; a time step that is `auto` is replaced by the number that is chosen for it.
         folder: the run directory; None keeps everything in memory.
         trust: modules outside the package that the configuration may name.
         problem: replaces `env.problem`.
@@ -89,6 +93,7 @@ def make_trainer(
     networks, physics, sampling, points = (int(word) for word in np.random.SeedSequence(seed).generate_state(4))
     torch.manual_seed(networks)
     problem = make_problem(config, trust) if problem is None else problem
+    choose_time_steps(config, problem)
     env: ReachAvoidEnv = build(_without_problem(config), "env", trust, problem=problem, seed=physics, device=device)
     parts = {"problem": problem, "simulator": env.simulator}
     actor, critics = make_networks(config, problem, trust)
@@ -97,12 +102,13 @@ def make_trainer(
         warnings.filterwarnings("ignore", message="No target network updater")
         # The networks were moved to their device before, so that the loss shares their buffers.
         loss = build(config.loss, "loss", trust, parts, problem=problem, actor=actor, critics=critics).to(device)
+    actor, learned = loss.actor_network.module, parts | {"solution": loss.solution()}
     return build(
         config.trainer,
         "trainer",
         trust,
         learner=build(config.learner, "learner", trust, loss=loss),
-        collector=build(config.collector, "collector", trust, env=env, actor=loss.actor_network.module, seed=sampling),
+        collector=build(config.collector, "collector", trust, learned, env=env, actor=actor, seed=sampling),
         collocation=build(config.collocation, "collocation", trust, parts),
         boundary=build(config.boundary, "boundary", trust, parts),
         schedule=build(config.schedule, "schedule", trust),
@@ -115,6 +121,25 @@ def make_trainer(
         config=OmegaConf.to_container(config, resolve=True),
         seed=points,
     )
+
+
+def choose_time_steps(config: DictConfig, problem: ReachAvoidProblem) -> None:
+    """Replace `auto` in env.dt and env.substeps by numbers, and print the choice with its reason.
+
+    Raises:
+        ConfigError: one of the two is neither `auto` nor a number.
+        ProblemError: the problem contradicts itself.
+        ArgumentError: the other of the two is out of range.
+    """
+    kinds = {"dt": float, "substeps": int}
+    values = {name: config.env[name] for name in kinds if name in config.env}
+    if AUTO not in values.values():
+        return
+    given = {name: convert(value, kinds[name], f"env.{name}") for name, value in values.items() if value != AUTO}
+    check_problem(problem)
+    chosen = propose_time_steps(problem, **given)
+    config.env.dt, config.env.substeps = chosen.dt, chosen.substeps
+    print(f"time: {chosen.reason}", flush=True)
 
 
 def _without_problem(config: DictConfig) -> DictConfig:

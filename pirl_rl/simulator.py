@@ -17,11 +17,13 @@ into their period at the end of each sub-step, before levels are taken there.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
+from pirl_rl.clock import Clock
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
 
@@ -33,11 +35,14 @@ class Step(NamedTuple):
         state: states after the step (N, n); a path that ended keeps the state of the sub-step in which it ended.
         reached: paths that reached A (N,) bool.
         failed: paths that entered B (N,) bool; none of them counts as reached.
+        noise: the sum of sigma dW over the sub-steps (N, n), in the units of the state. It includes sub-steps after an
+            exit, so that its mean given the state before the step is zero.
     """
 
     state: Tensor
     reached: Tensor
     failed: Tensor
+    noise: Tensor
 
 
 def exit_value(problem: ReachAvoidProblem, step: Step) -> Tensor:
@@ -73,6 +78,11 @@ class Simulator:
         if self.crossing not in ("bridge", "endpoint"):
             raise ArgumentError(f"crossing: expected 'bridge' or 'endpoint', got {self.crossing!r}")
 
+    @cached_property
+    def clock(self) -> Clock:
+        """Counts the control steps of the problem's horizon."""
+        return Clock(self.dt, self.problem.horizon)
+
     @torch.no_grad()
     def step(self, x: Tensor, u: Tensor, rng: torch.Generator | None = None, dt: Tensor | None = None) -> Step:
         """Advance paths that are outside A and B by one control step.
@@ -87,26 +97,34 @@ class Simulator:
         x = x.mT.contiguous().mT
         h = (x.new_tensor(self.dt) if dt is None else dt) / self.substeps
         reached = torch.zeros(x.shape[:-1], dtype=torch.bool, device=x.device)
-        failed = reached
+        failed, noise = reached, x
         for index in range(self.substeps):
-            moved, sigma = self._euler_maruyama(x, u, h, rng)
+            moved, kick, sigma = self._euler_maruyama(x, u, h, rng)
             now_reached, now_failed = self._exits(x, moved, sigma, h, rng)
             if index == 0:
-                x, reached, failed = moved, now_reached & ~now_failed, now_failed
+                x, reached, failed, noise = moved, now_reached & ~now_failed, now_failed, kick
                 continue
+            noise = noise + kick
             active = ~(reached | failed)
             x = torch.where(active.unsqueeze(-1), moved, x)
             failed = failed | (active & now_failed)
             reached = reached | (active & now_reached & ~now_failed)
-        return Step(x, reached, failed)
+        return Step(x, reached, failed, noise)
 
-    def flow(self, x: Tensor, u: Tensor) -> Tensor:
-        """States (N, n) after a control step without noise and exits; differentiable in x (N, n) and u (N, m)."""
+    def flow(self, x: Tensor, u: Tensor, dt: Tensor | None = None) -> Tensor:
+        """States (N, n) after a control step without noise and exits; differentiable in x (N, n) and u (N, m).
+
+        Args:
+            x: states (N, n).
+            u: physical controls (N, m).
+            dt: the length of the step for each state (N,), in s; default `self.dt` for all.
+        """
+        h = self.dt / self.substeps if dt is None else (dt / self.substeps).to(x)[..., None]
         for _ in range(self.substeps):
-            x = self.problem.states.wrap(x + self.problem.drift(x, u) * (self.dt / self.substeps))
+            x = self.problem.states.wrap(x + self.problem.drift(x, u) * h)
         return x
 
-    def _euler_maruyama(self, x: Tensor, u: Tensor, h: Tensor, rng) -> tuple[Tensor, Tensor]:
+    def _euler_maruyama(self, x: Tensor, u: Tensor, h: Tensor, rng) -> tuple[Tensor, Tensor, Tensor]:
         sigma = self.problem.diffusion(x, u)
         channels = sigma.shape[-1]
         noise = torch.randn((channels, *x.shape[:-1]), generator=rng, dtype=x.dtype, device=x.device) * h.sqrt()
@@ -115,7 +133,7 @@ class Simulator:
             moved = (sigma[(0,) * (sigma.ndim - 2)] @ noise).mT
         else:
             moved = (sigma * noise.movedim(0, -1).unsqueeze(-2)).sum(-1)
-        return self.problem.states.wrap(x + self.problem.drift(x, u) * h[..., None] + moved), sigma
+        return self.problem.states.wrap(x + self.problem.drift(x, u) * h[..., None] + moved), moved, sigma
 
     def _exits(self, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor, rng) -> tuple[Tensor, Tensor]:
         problem = self.problem

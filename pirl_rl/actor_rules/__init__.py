@@ -6,10 +6,11 @@ and d is 1 if the episode ended with it, else 0.
 """
 
 from pirl_rl.actor_rules.base import ActorRule
+from pirl_rl.actor_rules.best_control import BestControl
 from pirl_rl.actor_rules.clipped_surrogate import ClippedSurrogate
 from pirl_rl.actor_rules.hamiltonian import Hamiltonian
 from pirl_rl.actor_rules.look_ahead import LookAhead
 from pirl_rl.actor_rules.q import Q
 from pirl_rl.actor_rules.sum import Sum
 
-__all__ = ["ActorRule", "ClippedSurrogate", "Hamiltonian", "LookAhead", "Q", "Sum"]
+__all__ = ["ActorRule", "BestControl", "ClippedSurrogate", "Hamiltonian", "LookAhead", "Q", "Sum"]

@@ -16,10 +16,11 @@ from torchrl.data import TensorDictReplayBuffer
 
 from pirl_rl.collectors.multi_async import MultiAsyncCollector
 from pirl_rl.collectors.sync import SyncCollector
+from pirl_rl.collectors.transitions import ControlVariate
 from pirl_rl.errors import CollectorError
 from pirl_rl.sampling.initial_states import InitialStates
 
-__all__ = ["CollectorError", "MultiAsyncCollector", "SyncCollector", "TransitionCollector"]
+__all__ = ["CollectorError", "ControlVariate", "MultiAsyncCollector", "SyncCollector", "TransitionCollector"]
 
 logging.getLogger("torchrl").setLevel(logging.WARNING)
 

@@ -13,11 +13,12 @@ from functools import partial
 from typing import Any, Literal
 
 import torch
+from torch import nn
 from torchrl import collectors as torchrl_collectors
 from torchrl.weight_update import SharedMemWeightSyncScheme
 
 from pirl_rl.collectors.buffers import buffer_state, check_sizes, fill_buffer, load_buffer, make_buffer
-from pirl_rl.collectors.transitions import Exploration, Transitions, exploring_policy
+from pirl_rl.collectors.transitions import ControlVariate, Exploration, Transitions, exploring_policy
 from pirl_rl.envs import ReachAvoidEnv
 from pirl_rl.errors import ArgumentError, CollectorError
 from pirl_rl.internals import lock_writes_with, write_lock
@@ -34,7 +35,8 @@ class MultiAsyncCollector:
         workers: the number of processes.
         frames_per_batch: transitions that a worker delivers at once, a multiple of the environment's batch size.
         updates_per_batch: updates between two copies of the actor.
-        warmup_frames, buffer_size, exploration_noise, exploration, n_steps, seed: arguments of `SyncCollector`.
+        warmup_frames, buffer_size, exploration_noise, exploration, n_steps, control_variate, seed: arguments of
+            `SyncCollector`.
         patience: seconds without a new transition after which `CollectorError` is raised; for a worker that died it is
             raised at once.
 
@@ -54,6 +56,7 @@ class MultiAsyncCollector:
         exploration_noise: float = 0.0,
         exploration: Literal["always", "start"] = "always",
         n_steps: int = 20,
+        control_variate: ControlVariate | None = None,
         seed: int = 0,
         patience: float = 60.0,
     ):
@@ -62,7 +65,8 @@ class MultiAsyncCollector:
             raise ArgumentError(f"collector.workers: expected at least 1, got {workers}")
         self.updates_per_batch, self.warmup_frames, self.patience = updates_per_batch, warmup_frames, patience
         self.buffer, self._rng = make_buffer(buffer_size, torch.device("cpu"), seed, shared=True)
-        self._actor, self._seed, self._exploration = actor, seed, Exploration(exploration_noise, exploration)
+        self._networks = nn.ModuleList([actor] if control_variate is None else [actor, control_variate])
+        self._seed, self._exploration = seed, Exploration(exploration_noise, exploration)
         self._env, self._workers, self._random_warmup = env, workers, True
         self._frames_per_batch, self._transitions = frames_per_batch, Transitions(n_steps)
         self._collector: Any = None
@@ -106,8 +110,9 @@ class MultiAsyncCollector:
         # The seeds depend on the count of transitions, so that a later start does not repeat the noise of the first.
         seeds = range(first := self._seed + 1 + self.buffer.write_count, first + self._workers)
         recipes = [self._env.recipe(seed) for seed in seeds]
-        self._copy = copy.deepcopy(self._actor).cpu()
-        self._policy = exploring_policy(self._copy, self._exploration)
+        self._copy = copy.deepcopy(self._networks).cpu()
+        actor, *control_variate = self._copy
+        self._policy = exploring_policy(actor, self._exploration, *control_variate)
         # The state of the random generator does not survive being sent to a spawned process, and only the learner's
         # process watches the workers.
         self.buffer.set_rng(None)
@@ -141,7 +146,7 @@ class MultiAsyncCollector:
     def step(self, update: int) -> None:
         self._check_workers()
         if update % self.updates_per_batch == 0:
-            self._copy.load_state_dict(self._actor.state_dict())
+            self._copy.load_state_dict(self._networks.state_dict())
             self._collector.update_policy_weights_(self._policy)
 
     def close(self) -> None:

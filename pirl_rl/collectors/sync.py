@@ -9,7 +9,7 @@ from torchrl.collectors import Collector
 
 from pirl_rl.checkpoint import restore_rng
 from pirl_rl.collectors.buffers import buffer_state, check_sizes, fill_buffer, load_buffer, make_buffer
-from pirl_rl.collectors.transitions import Exploration, Transitions, exploring_policy
+from pirl_rl.collectors.transitions import ControlVariate, Exploration, Transitions, exploring_policy
 from pirl_rl.envs import ReachAvoidEnv
 from pirl_rl.internals import carried, plays_at_random
 from pirl_rl.networks import Actor
@@ -30,6 +30,8 @@ class SyncCollector:
         exploration_noise: standard deviation of the noise on actions, which are normalised to [-1, 1].
         exploration: "always" for noise on every action, "start" for the first of each episode, see `Exploration`.
         n_steps: the length of returns, in control steps; with `exploration="start"` it should be above 1.
+        control_variate: takes the noise of the physics out of the returns, see `pirl_rl.collectors.transitions`; None
+            leaves it in.
         seed: the seed of sampling from the buffer.
 
     Raises:
@@ -47,6 +49,7 @@ class SyncCollector:
         exploration_noise: float = 0.0,
         exploration: Literal["always", "start"] = "always",
         n_steps: int = 20,
+        control_variate: ControlVariate | None = None,
         seed: int = 0,
     ):
         check_sizes(env, frames_per_batch, updates_per_batch, warmup_frames, buffer_size)
@@ -55,7 +58,7 @@ class SyncCollector:
         self._exploration = Exploration(exploration_noise, exploration)
         self._collector = Collector(
             env,
-            exploring_policy(actor, self._exploration),
+            exploring_policy(actor, self._exploration, control_variate),
             frames_per_batch=frames_per_batch,
             total_frames=-1,
             init_random_frames=-(-warmup_frames // frames_per_batch) * frames_per_batch,
@@ -122,7 +125,7 @@ class SyncCollector:
         self._collector.load_state_dict({**self._collector.state_dict(), "frames": frames})  # type: ignore[arg-type]
 
     def _collect(self) -> None:
-        # In the warm-up, TorchRL leaves an earlier output of the actor, "loc", beside the random actions.
+        # In the warm-up, TorchRL leaves earlier outputs of the policy, "loc" and "slope", beside the random actions.
         random = plays_at_random(self._collector)
         batch = next(self._batches)
-        self.buffer.extend(self._transitions(batch.exclude("loc") if random else batch))
+        self.buffer.extend(self._transitions(batch.exclude("loc", "slope") if random else batch))

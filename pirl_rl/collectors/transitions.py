@@ -1,8 +1,18 @@
-"""Exploration noise on actions, and n-step transitions from batches of steps."""
+"""The policy that collectors play, and n-step transitions from batches of steps.
+
+With `control_variate`, the noise of the physics is taken out of the returns. Over the steps k of a return, the return
+
+    y = sum_k r_k + (1 - d) V(tau_n, x_n) - sum_k grad V(tau_k, x_k) . (sigma dW)_k         Eq. (control_variate)
+
+has the same mean as without the last sum, whatever V is, because the increment of the Brownian motion in a step has
+mean zero and is independent of all that came before. Where V is exact, Ito's formula says that the last sum is the
+deviation of the return from its mean, up to the size of a step. So the returns become more certain while V is learned.
+The cost is one gradient of V at each step, for any number of noise channels.
+"""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -10,7 +20,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 
 from pirl_rl.errors import ArgumentError
-from pirl_rl.networks import Actor
+from pirl_rl.solution import Solution
 
 TRANSITION = ("tau", "state", "action", "loc", *(("next", key) for key in ("tau", "state", "reward", "terminated")))
 """The entries of a transition that the loss reads; "loc" is the output of the actor, "action" the played action."""
@@ -44,19 +54,42 @@ class Exploration(nn.Module):
         return (loc + (noise if self.when == "always" else noise * is_init)).clamp(-1, 1)
 
 
-def exploring_policy(actor: Actor, exploration: Exploration) -> TensorDictSequential:
-    """The actor followed by the noise, as a policy for collectors."""
-    return TensorDictSequential(
-        TensorDictModule(actor, in_keys=["tau", "state"], out_keys=["loc"]),  # type: ignore[arg-type]
-        TensorDictModule(exploration, in_keys=["loc", "is_init"], out_keys=["action"]),  # type: ignore[arg-type]
-    )
+class ControlVariate(nn.Module):
+    """Notes grad V(tau, x) at each step, by which the noise of the physics is taken out of the returns.
+
+    Args:
+        solution: gives V, the mean of its critics.
+    """
+
+    def __init__(self, solution: Solution):
+        super().__init__()
+        self.critic = solution.critic
+
+    def forward(self, tau: Tensor, state: Tensor, action: Tensor) -> Tensor:
+        """The slope (N, n) of V, per unit of the state, at tau (N, 1) and state (N, n), at a frozen action (N, m)."""
+        value = self.critic.at(action)
+        return torch.func.grad(lambda x: value(tau.squeeze(-1), x).mean(0).sum())(state)
+
+
+def exploring_policy(
+    actor: nn.Module, exploration: Exploration, control_variate: nn.Module | None = None
+) -> TensorDictSequential:
+    """The actor followed by the noise and, if there is one, the control variate, as a policy for collectors."""
+    modules: list[Any] = [
+        TensorDictModule(actor, in_keys=["tau", "state"], out_keys=["loc"]),
+        TensorDictModule(exploration, in_keys=["loc", "is_init"], out_keys=["action"]),
+    ]
+    if control_variate is not None:
+        modules.append(TensorDictModule(control_variate, in_keys=["tau", "state", "loc"], out_keys=["slope"]))
+    return TensorDictSequential(*modules)
 
 
 class Transitions:
     """Turns a batch (envs, steps) into transitions (envs * steps,) with n-step returns without discount.
 
     "next" is the state n steps later, or the last one of the episode or of the batch if that ends earlier. Its "reward"
-    is the sum of the rewards until then.
+    is the sum of the rewards until then. If a control variate noted the slope of V, the reward has the last sum of
+    Eq. (control_variate) subtracted; it then need not lie in [0, 1].
 
     Args:
         n_steps: the length of returns, in control steps.
@@ -74,6 +107,7 @@ class Transitions:
         if "loc" not in batch.keys():
             # The random actions of a warm-up come from no actor.
             batch = batch.set("loc", batch["action"])
+        gain = (batch["slope"] * batch["next", "noise"]).sum(-1, keepdim=True) if "slope" in batch.keys() else None
         batch = batch.select(*TRANSITION)
         following: TensorDictBase = batch.get("next")
         reward, ended = following["reward"], following["terminated"]
@@ -84,5 +118,8 @@ class Transitions:
             more = ~ended.gather(1, end) & (end < batch.shape[1] - 1)
             end = end + more
             total = total + reward.gather(1, end) * more
+        if gain is not None:
+            until = gain.cumsum(1)
+            total = total - (until.gather(1, end) - until + gain)
         batch["next"] = following.gather(1, end.squeeze(-1)).set("reward", total)
         return batch.reshape(-1)

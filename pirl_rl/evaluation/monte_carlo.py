@@ -24,9 +24,6 @@ Array = TypeVar("Array", float, np.ndarray, Tensor)
 CHUNK = 32_768
 """Number of paths that are simulated at once. It bounds the memory, and a step fits into the cache of a core."""
 
-STEP_TOLERANCE = 1e-4
-"""The fraction of a step by which tau may exceed whole steps without a further step, because float32 rounds tau."""
-
 
 class Estimate(NamedTuple):
     """Means (N,) of `rollouts` payoffs and the ends (N,) of their confidence intervals, as tensors or arrays like the
@@ -126,7 +123,7 @@ def mean_payoff(
     """Mean payoff (N,), float64, of paths from tau (N,) and x (N, n); the arguments are those of `monte_carlo`."""
     x = simulator.problem.states.wrap(x)
     known, value = _known(simulator.problem, tau, x)
-    steps = torch.ceil(tau.double() / simulator.dt - STEP_TOLERANCE).clamp(min=1).long()
+    steps = simulator.clock.split(tau)[0].clamp(min=1)
     total, unknown = torch.zeros_like(tau, dtype=torch.float64), (~known).nonzero().squeeze(-1)
     count = len(unknown) * rollouts
     for start in range(0, count, CHUNK):
@@ -138,7 +135,7 @@ def mean_payoff(
 def _known(problem: ReachAvoidProblem, tau: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
     """A mask (N,) of the points whose value needs no simulation, and their value (N,)."""
     on_boundary, reached = ~problem.interior(x) | (tau <= 0), problem.reached(x)
-    value = exit_value(problem, Step(x, reached & ~problem.failed(x), problem.failed(x)))
+    value = exit_value(problem, Step(x, reached & ~problem.failed(x), problem.failed(x), torch.zeros_like(x)))
     return on_boundary | problem.unreachable(x), value * on_boundary
 
 

@@ -133,9 +133,9 @@ def visited_by(
     simulator: Simulator, policy: Policy, starts: InitialStates, episodes: int, rng: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """tau (M,) in s and states (M, n) on the paths of a policy, from each start to the last state before the end."""
-    max_steps = round(simulator.problem.horizon / simulator.dt)
-    steps, x = starts.sample(simulator.problem, episodes, max_steps, rng, torch.get_default_dtype())
-    paths = closed_loop(simulator, policy, (steps * simulator.dt).to(x), x, rng)
+    clock = simulator.clock
+    steps, x = starts.sample(simulator.problem, episodes, clock.max_steps, rng, torch.get_default_dtype())
+    paths = closed_loop(simulator, policy, clock.time(steps).to(x), x, rng)
     index = torch.arange(len(paths.tau), device=x.device).unsqueeze(-1)
     return paths.tau[index < paths.steps], paths.state[index < paths.steps]
 

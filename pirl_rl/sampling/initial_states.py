@@ -1,4 +1,4 @@
-"""Initial states of episodes: x outside A and B, and a whole number of control steps to go, so that tau = steps dt."""
+"""Initial states of episodes: x outside A and B, and a number of control steps to go, see `pirl_rl.clock`."""
 
 from __future__ import annotations
 

@@ -1,0 +1,60 @@
+"""Imitation of the best control of the Hamiltonian among a few levels of each coordinate."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from pirl_rl.actor_rules.base import ActorRule
+from pirl_rl.ascent import ascend, hamiltonian, stakes
+from pirl_rl.errors import ArgumentError
+from pirl_rl.networks import Critic
+from pirl_rl.operators import masked_mean
+from pirl_rl.problem import ReachAvoidProblem, has_controlled_noise
+from pirl_rl.solution import Solution
+
+
+class BestControl(ActorRule):
+    """The negative mean of T sum_i w_i CE((1 + a_i)/2, (1 + pi_i)/2) over points, Eq. (best_control).
+
+    The points are the collocation points; if the weight of the HJB residual is 0, those of the transitions. a is the
+    best action of the Hamiltonian, see `pirl_rl.ascent`, pi the actor's output, and CE the cross-entropy. The weight
+    w_i is the range of the Hamiltonian in coordinate i, so that states at which the control hardly matters hardly
+    count, and T is the horizon. The gradient in the output before the tanh is T w_i (pi_i - a_i), which does not
+    vanish where the tanh is saturated at the wrong bound: unlike a gradient of the Hamiltonian in u, the rule
+    corrects such an action.
+
+    Args:
+        problem: the physics.
+        levels: the number of levels of each coordinate of the control among the candidates, bounds included; at least
+            2. Two levels find the maximum where the drift is affine in u and sigma does not depend on u.
+
+    Raises:
+        ArgumentError: `levels` is below 2.
+    """
+
+    def __init__(self, problem: ReachAvoidProblem, levels: int = 5):
+        if levels < 2:
+            raise ArgumentError(f"actor_rule.levels: expected at least 2, got {levels}")
+        self.levels, self.controlled_noise = levels, has_controlled_noise(problem)
+
+    def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
+        tau, x = points["tau"], points["state"]
+        logits = solution.actor.logits(tau, x)
+        with torch.no_grad():
+            action = torch.tanh(logits)
+            objective = hamiltonian(solution, tau.squeeze(-1), x, self.controlled_noise)
+            best, _ = ascend(objective, action, torch.linspace(-1, 1, self.levels).to(action))
+            weight = stakes(objective, action)
+        # pi = tanh(z) is 2 sigmoid(2 z) - 1, so that 2 z is the logit of (1 + pi)/2.
+        entropy = torch.nn.functional.binary_cross_entropy_with_logits(2 * logits, (1 + best) / 2, reduction="none")
+        loss = solution.problem.horizon * (weight * entropy).sum(-1)
+        mask = points["mask"] if "mask" in points.keys() else torch.ones_like(loss, dtype=torch.bool)
+        return -masked_mean(loss, mask)
+
+    def check(self, critic: Critic, exploration_noise: float | None = None) -> None:
+        if critic.action_input:
+            raise ArgumentError(
+                "actor_rule: BestControl differentiates V(tau, x), expected critic.action_input=false, got true"
+            )

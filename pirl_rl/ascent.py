@@ -1,0 +1,86 @@
+"""Ascent of the Hamiltonian to the best control at a state, at a cost that is linear in the number m of controls.
+
+The Hamiltonian of V is the part of L^u V, Eq. (parabolic_operator), that depends on the control:
+
+    H(u) = f(x, u) . grad V,   plus 1/2 Tr(sigma sigma^T hess V) where sigma depends on u.
+
+V is differentiated once for a state, and each control that is tried costs one evaluation of the physics. The ascent
+gives one coordinate of the control after the other its best level while the rest stand still. It finds the maximum over
+the levels if H is a sum of functions of one coordinate each, as for a drift that is affine in u and a sigma without u,
+where the maximum is a vertex of the box of controls. Unlike steps along a gradient in u, it leaves a local maximum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from pirl_rl.solution import Solution
+
+Objective = Callable[[Tensor], Tensor]
+"""Maps actions (N, m), normalised to [-1, 1], to numbers (N,), each of which depends on its own action alone."""
+
+
+def hamiltonian(solution: Solution, tau: Tensor, x: Tensor, controlled_noise: bool) -> Objective:
+    """H (N,), in 1/s, as a function of the normalised action (N, m).
+
+    Args:
+        solution: gives V, whose action is frozen at the policy's, and the problem.
+        tau: times to go (N,), in s.
+        x: states (N, n).
+        controlled_noise: whether sigma depends on u, see `pirl_rl.problem.has_controlled_noise`.
+    """
+    problem, slope = solution.problem, solution.gradient(tau, x)
+    curvature = solution.hessian(tau, x) if controlled_noise else None
+
+    def value(action: Tensor) -> Tensor:
+        u = problem.controls.denormalize(action)
+        along = (problem.drift(x, u) * slope).sum(-1)
+        if curvature is None:
+            return along
+        sigma = problem.diffusion(x, u)
+        return along + (sigma * (curvature @ sigma)).sum((-2, -1)) / 2
+
+    return value
+
+
+def ascend(objective: Objective, action: Tensor, levels: Tensor, sweeps: int = 1) -> tuple[Tensor, Tensor]:
+    """Coordinate-wise ascent over levels.
+
+    Args:
+        objective: the function to maximise.
+        action: where the ascent starts (N, m).
+        levels: the levels (k,) of each coordinate.
+        sweeps: how often it passes through all coordinates.
+
+    Returns:
+        The action (N, m) that was found, and its objective (N,), which is at least that of the start.
+    """
+    best = objective(action)
+    for _ in range(sweeps):
+        for i in range(action.shape[-1]):
+            for level in levels.unbind():
+                trial = replaced(action, i, level)
+                value = objective(trial)
+                better = value > best
+                best, action = torch.where(better, value, best), torch.where(better.unsqueeze(-1), trial, action)
+    return action, best
+
+
+def stakes(objective: Objective, action: Tensor) -> Tensor:
+    """How much each coordinate matters (N, m): the range of the objective at its bounds -1 and 1 and at the action."""
+    own = objective(action)
+    ranges = []
+    for i in range(action.shape[-1]):
+        values = torch.stack([own, *(objective(replaced(action, i, bound)) for bound in (-1.0, 1.0))])
+        ranges.append(values.amax(0) - values.amin(0))
+    return torch.stack(ranges, -1)
+
+
+def replaced(action: Tensor, column: int, level: Tensor | float) -> Tensor:
+    """The action (N, m) with one coordinate replaced by a number."""
+    changed = action.clone()
+    changed[:, column] = level
+    return changed

@@ -1,0 +1,131 @@
+"""The rates of a problem, measured at sampled states and controls: across its box, across its sets, and of its drift.
+
+Across a length L the drift f moves a path by |f| t in a time t, and the noise by |sigma| sqrt(t). For a coordinate, L
+is the width of the box. For a constraint g of A or B, which is -D where the set is deepest, the drift gives
+|grad g . f| t, the noise |sigma^T grad g| sqrt(t), and L is D. All rates are medians over the samples: the corners of a
+box may have rates that no path meets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.sets import Box
+
+DESCENT = 200
+"""Steps of the descent by which deep points of a set are found."""
+
+FIRST, LAST = 0.05, 1e-4
+"""Sizes of the first and the last of these steps, in coordinates in which the box is [-1, 1]^n."""
+
+STARTS = 64
+"""Points from which the descent starts."""
+
+DIFFERENCE = 1e-6
+"""Half the step of the differences in the drift's Jacobian, in half widths of the box."""
+
+JACOBIANS = 256
+"""The number of states at which the Jacobian is taken."""
+
+
+class Move(NamedTuple):
+    """The rates of paths across something.
+
+    Attributes:
+        across: what is crossed, for messages.
+        speed: of the drift, in 1/s.
+        spread: of the noise, in 1/sqrt(s).
+    """
+
+    across: str
+    speed: float
+    spread: float
+
+
+def across_box(problem: ReachAvoidProblem, x: Tensor, u: Tensor) -> Move:
+    """The rates along the fastest coordinate, in widths of the box.
+
+    Args:
+        problem: the physics.
+        x: states (N, n).
+        u: physical controls (N, m).
+    """
+    width = 2 * problem.states.center_and_half_width(x)[1]
+    speed = (problem.drift(x, u).abs() / width).amax(-1)
+    spread = (problem.diffusion(x, u).norm(dim=-1) / width).amax(-1)
+    return Move("the box", speed.median().item(), spread.median().item())
+
+
+def across_sets(problem: ReachAvoidProblem, x: Tensor, u: Tensor) -> list[Move]:
+    """The rates across all constraints of A and B, in depths; a set in which no point is found has none.
+
+    Args:
+        problem: the physics.
+        x: states (N, n), from which the sets are searched too.
+        u: physical controls (N, m).
+    """
+    moves = []
+    if problem.objective == "reach-avoid":
+        moves += _across(problem, "the target", problem.reached_constraints, x, u)
+    if problem.has_avoid_set:
+        # B is a union: each of its constraints is a set of its own.
+        for index in range(problem.avoid_constraints(x[:1]).shape[-1]):
+            moves += _across(problem, "the avoid set", _part(problem.avoid_constraints, index), x, u)
+    return moves
+
+
+def fastest_rate(problem: ReachAvoidProblem, x: Tensor, u: Tensor) -> float:
+    """The largest modulus of an eigenvalue of the drift's Jacobian, in 1/s, at x (N, n) and u (N, m)."""
+    x, u = x[:JACOBIANS], u[:JACOBIANS]
+    # By central differences, because a drift has to be differentiable for nothing else.
+    steps = torch.diag(DIFFERENCE * problem.states.center_and_half_width(x)[1])
+    f, wrap = problem.drift, problem.states.wrap
+    columns = [(f(wrap(x + h), u) - f(wrap(x - h), u)) / (2 * h.sum()) for h in steps]
+    jacobian = torch.stack(columns, -1)
+    finite = jacobian.isfinite().flatten(1).all(-1)
+    return torch.linalg.eigvals(jacobian[finite]).abs().amax(-1).median().item() if finite.any() else float("nan")
+
+
+def _part(constraints: Callable[[Tensor], Tensor], index: int) -> Callable[[Tensor], Tensor]:
+    return lambda x: constraints(x)[..., index : index + 1]
+
+
+def _across(
+    problem: ReachAvoidProblem, name: str, constraints: Callable[[Tensor], Tensor], x: Tensor, u: Tensor
+) -> list[Move]:
+    """The rates across each constraint of the set in which all of them hold, at points inside it."""
+    inside = torch.cat([x, _descended(constraints, x, problem.states)])
+    inside = inside[(constraints(inside) <= 0).all(-1)]
+    if not len(inside):
+        return []
+    u = u[torch.arange(len(inside)) % len(u)]
+    f, sigma = problem.drift(inside, u), problem.diffusion(inside, u)
+    speed = torch.func.jvp(constraints, (inside,), (f,))[1].abs().median(0).values
+    columns = [torch.func.jvp(constraints, (inside,), (column,))[1] for column in sigma.unbind(-1)]
+    spread = torch.stack(columns).norm(dim=0).median(0).values
+    rates = zip((-constraints(inside)).amax(0).tolist(), speed.tolist(), spread.tolist(), strict=True)
+    return [Move(name, v / depth, s / depth) for depth, v, s in rates if depth > 0]
+
+
+def _descended(constraints: Callable[[Tensor], Tensor], x: Tensor, box: Box) -> Tensor:
+    """Deep points of a set: descent of its level from the lowest of the states x, within twice the box."""
+
+    def level(z: Tensor) -> Tensor:
+        return constraints(box.wrap(box.denormalize(z))).amax(-1)
+
+    z = box.normalize(x)
+    z = z[level(z).argsort()[:STARTS]].clone().requires_grad_()
+    slope, optimizer = torch.func.grad(lambda z: level(z).sum()), torch.optim.Adam([z], lr=FIRST)
+    decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST / FIRST) ** (1 / DESCENT))
+    for _ in range(DESCENT):
+        z.grad = slope(z.detach())
+        optimizer.step()
+        decay.step()
+        with torch.no_grad():
+            z.clamp_(-2, 2)
+    return box.wrap(box.denormalize(z.detach()))

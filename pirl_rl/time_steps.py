@@ -1,0 +1,142 @@
+"""Control interval and integration steps of a problem, chosen from its own rates, see `pirl_rl.rates`.
+
+A control is held during a control step, so that in one step a path should neither cross much of the box of states nor
+pass through a set. The control step is the longest for which the moves of drift and noise are below the shares that
+stand here. Within it the drift is integrated in sub-steps. They resolve its fastest rate, and they are halved until a
+control step without noise is that of ten times as many.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pirl_rl.errors import ArgumentError
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.rates import Move, across_box, across_sets, fastest_rate
+from pirl_rl.simulator import Simulator
+
+SHARES = {"the box": (0.05, 0.1), "the target": (0.5, 0.5), "the avoid set": (0.5, 0.5)}
+"""The largest moves of drift and noise in one control step, in widths of the box and depths of the sets."""
+
+STEPS = (20, 25, 30, 40, 50, 60, 80, 100, 120, 150, 200, 250, 300, 400)
+"""The numbers of control steps in the horizon from which one is taken."""
+
+TOLERANCE = 1e-3
+"""The largest error of a control step without noise, in widths of the box, that is accepted."""
+
+COVERED = 0.95
+"""The share of the sampled states at which the error is below the tolerance."""
+
+MOST_SUBSTEPS = 256
+"""The largest number of sub-steps that is proposed."""
+
+
+class TimeSteps(NamedTuple):
+    """A choice of time steps.
+
+    Attributes:
+        dt: the length of a control step, in s.
+        substeps: the number of integration steps in a control step.
+        reason: the choice and the measured numbers behind it, in whole sentences.
+    """
+
+    dt: float
+    substeps: int
+    reason: str
+
+
+def propose_time_steps(
+    problem: ReachAvoidProblem,
+    dt: float | None = None,
+    substeps: int | None = None,
+    samples: int = 1024,
+    seed: int = 0,
+) -> TimeSteps:
+    """Choose the control step, which then divides the horizon, and the integration steps of a problem.
+
+    Args:
+        problem: the physics.
+        dt: a control step in s that is given, so that the sub-steps alone are chosen.
+        substeps: a number of sub-steps that is given, so that the control step alone is chosen.
+        samples: the number of states in the box, and of controls, half of them vertices, at which rates are measured.
+        seed: of the samples.
+
+    Raises:
+        ArgumentError: `dt`, `substeps` or `samples` is out of range.
+    """
+    if samples < 1:
+        raise ArgumentError(f"samples: expected at least 1, got {samples}")
+    x, u = _samples(problem, samples, seed)
+    moves, rate = [across_box(problem, x, u), *across_sets(problem, x, u)], fastest_rate(problem, x, u)
+    chosen, limit = _control_step(problem.horizon, moves) if dt is None else (dt, "")
+    count = _substeps(problem, chosen, rate, x, u) if substeps is None else substeps
+    error = _error(problem, chosen, count, x, u)
+    plural = "s" if count > 1 else ""
+    sentences = (
+        f"Control step {chosen:.4g} s, {problem.horizon / chosen:.4g} in the horizon, with {count} integration "
+        f"step{plural}.",
+        limit,
+        f"In a control step drift and noise move a path by {_parts(moves, chosen)}; the drift's fastest rate is "
+        f"{rate:.3g} 1/s; ten times as many integration steps change it by {error:.1g} of the box.",
+    )
+    return TimeSteps(chosen, count, " ".join(filter(None, sentences)))
+
+
+def _samples(problem: ReachAvoidProblem, count: int, seed: int) -> tuple[Tensor, Tensor]:
+    """States outside A and B, or all of the box if none are found, and as many controls; in double precision."""
+    rng = torch.Generator().manual_seed(seed)
+    x = problem.states.sample(count, rng, dtype=torch.float64)
+    outside = problem.interior(x)
+    x = x[outside] if outside.any() else x
+    action = 2 * torch.rand(len(x), problem.controls.dim, generator=rng, dtype=x.dtype) - 1
+    action[::2] = action[::2].sign()
+    return x, problem.controls.denormalize(action)
+
+
+def _longest(move: Move) -> float:
+    """The longest control step, in s, in which drift and noise each move by at most their share."""
+    drift, noise = SHARES[move.across]
+    by_drift = drift / move.speed if move.speed > 0 else float("inf")
+    return min(by_drift, (noise / move.spread) ** 2) if move.spread > 0 else by_drift
+
+
+def _control_step(horizon: float, moves: list[Move]) -> tuple[float, str]:
+    """The longest control step that the moves allow, with a number of steps out of `STEPS`, and what limits it."""
+    slowest = min(moves, key=_longest)
+    wanted, across = _longest(slowest), slowest.across
+    steps = next((steps for steps in STEPS if horizon / steps <= wanted), STEPS[-1])
+    if steps == STEPS[0]:
+        limit = ""
+    elif horizon / steps <= wanted:
+        limit = f"Moves across {across} limit the control step."
+    else:
+        limit = f"Moves across {across} ask for {wanted:.2g} s, but more than {STEPS[-1]} steps are not proposed."
+    return horizon / steps, limit
+
+
+def _substeps(problem: ReachAvoidProblem, dt: float, rate: float, x: Tensor, u: Tensor) -> int:
+    """The smallest power of two that resolves the fastest rate and whose error is accepted."""
+    count = 1
+    while count < min(dt * rate, MOST_SUBSTEPS):
+        count *= 2
+    while count < MOST_SUBSTEPS and not _error(problem, dt, count, x, u) <= TOLERANCE:
+        count *= 2
+    return count
+
+
+def _error(problem: ReachAvoidProblem, dt: float, substeps: int, x: Tensor, u: Tensor) -> float:
+    """How far ten times as many sub-steps change a control step without noise, in widths of the box."""
+    coarse, fine = (Simulator(problem, dt, count).flow(x, u) for count in (substeps, 10 * substeps))
+    gap = (coarse - fine).abs() / (2 * problem.states.center_and_half_width(x)[1])
+    errors = gap.amax(-1).nan_to_num(torch.inf).sort().values
+    return errors[int(COVERED * (len(errors) - 1))].item()
+
+
+def _parts(moves: list[Move], dt: float) -> str:
+    """The moves of drift and noise in one control step, across the box and the fastest constraint of each set."""
+    names = dict.fromkeys(move.across for move in moves)
+    fastest = [min((move for move in moves if move.across == name), key=_longest) for name in names]
+    return ", ".join(f"{move.speed * dt:.2g} and {move.spread * dt**0.5:.2g} of {move.across}" for move in fastest)

@@ -1,0 +1,119 @@
+"""Ascent to the best control of the Hamiltonian, and the actor rule that imitates it."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from pirl_rl import Box, ReachAvoidProblem
+from pirl_rl.actor_rules import BestControl, Hamiltonian
+from pirl_rl.ascent import ascend, hamiltonian, stakes
+from pirl_rl.errors import ArgumentError
+from pirl_rl.networks import Actor, Critic, stack
+from pirl_rl.problem import has_controlled_noise
+from pirl_rl.problems import Reach1D
+from pirl_rl.solution import Solution
+
+
+class Steered(ReachAvoidProblem):
+    """dX = (u + 0.1 X) dt + sigma dW in the plane, with noise that grows with u_2 if `controlled`."""
+
+    horizon = 2.0
+    states, controls = Box([-1.0, -1.0], [1.0, 1.0]), Box([-1.0, -2.0, -1.0], [1.0, 1.0, 3.0])
+
+    def __init__(self, controlled: bool = False):
+        super().__init__()
+        self.controlled = controlled
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return u[..., :2] + u[..., 2:] * x.flip(-1) + 0.1 * x
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        scale = 0.5 + 0.2 * u[..., 1] if self.controlled else torch.full_like(x[..., 0], 0.5)
+        return scale[..., None, None] * torch.eye(2).to(x)
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return 1.0 - x[..., 0]
+
+
+def solution_of(problem: ReachAvoidProblem, seed: int = 0) -> Solution:
+    torch.manual_seed(seed)
+    return Solution(problem, Actor(problem), stack([Critic(problem, output="Sigmoid")]))
+
+
+def points(problem: ReachAvoidProblem, count: int = 64) -> tuple[Tensor, Tensor]:
+    rng = torch.Generator().manual_seed(1)
+    return problem.horizon * torch.rand(count, generator=rng), problem.states.sample(count, rng)
+
+
+@pytest.mark.parametrize("controlled", [False, True])
+def test_the_hamiltonian_is_the_part_of_the_residual_that_depends_on_the_control(controlled):
+    problem = Steered(controlled)
+    assert has_controlled_noise(problem) == controlled
+    solution, (tau, x) = solution_of(problem), points(problem)
+    objective = hamiltonian(solution, tau, x, controlled)
+    one, other = (2 * torch.rand(len(x), 3) - 1 for _ in range(2))
+    residuals = [solution.residual(tau, x, problem.controls.denormalize(action)) for action in (one, other)]
+    assert torch.allclose(objective(one) - objective(other), residuals[0] - residuals[1], atol=1e-5)
+
+
+@pytest.mark.parametrize("controlled", [False, True])
+def test_the_ascent_finds_the_best_of_all_levels(controlled):
+    problem, levels = Steered(controlled), torch.linspace(-1, 1, 5)
+    solution, (tau, x) = solution_of(problem), points(problem)
+    objective = hamiltonian(solution, tau, x, controlled)
+    every = torch.stack(
+        [objective(torch.tensor(choice).expand(len(x), 3)) for choice in itertools.product(levels.tolist(), repeat=3)]
+    )
+    action, value = ascend(objective, torch.zeros(len(x), 3), levels)
+    # H is a sum over the controls, so that one sweep finds its maximum over the levels.
+    assert torch.allclose(value, every.amax(0), atol=1e-6)
+    assert torch.allclose(objective(action), value)
+
+
+def test_stakes_are_the_slopes_of_an_affine_objective():
+    slope = torch.tensor([3.0, 0.0, -0.5])
+    assert torch.allclose(stakes(lambda action: action @ slope, torch.zeros(4, 3)), 2 * slope.abs().expand(4, 3))
+
+
+def test_the_rule_turns_a_saturated_actor_round_where_the_gradient_of_the_hamiltonian_does_not():
+    problem = Reach1D()  # the best control is 1 everywhere
+    tau, x = points(problem, 256)
+    replay = TensorDict({"tau": tau.unsqueeze(-1), "state": x}, batch_size=[256])
+    pushed = {}
+    for rule in (BestControl(problem), Hamiltonian(problem)):
+        solution = Solution(problem, Actor(problem), stack([Rising(problem)]))
+        last = solution.actor.layers[-2]
+        torch.nn.init.zeros_(last.weight)
+        torch.nn.init.constant_(last.bias, -12.0)
+        rule(solution, replay, replay).backward()
+        pushed[type(rule)] = last.bias.grad.item()
+    # tanh'(-12) is 1.5e-10, and the rule's own gradient is T w (a - pi) = 2 * 2 * 2 for a slope of 1.
+    assert pushed[BestControl] == pytest.approx(8.0, rel=1e-3)
+    assert abs(pushed[Hamiltonian]) < 1e-8
+
+
+class Rising(Critic):
+    """V = x_1, for which the best control is known."""
+
+    def forward(self, tau: Tensor, state: Tensor, action: Tensor) -> Tensor:
+        return state[..., :1].unsqueeze(0)
+
+
+def test_masked_points_do_not_count():
+    problem = Steered()
+    solution, (tau, x) = solution_of(problem), points(problem)
+    every = TensorDict({"tau": tau.unsqueeze(-1), "state": x, "mask": torch.arange(64) < 32}, batch_size=[64])
+    rule = BestControl(problem)
+    assert torch.allclose(rule(solution, every, every), rule(solution, every[:32], every[:32].exclude("mask")))
+
+
+def test_what_the_rule_refuses():
+    with pytest.raises(ArgumentError, match=r"actor_rule.levels: expected at least 2, got 1"):
+        BestControl(Reach1D(), levels=1)
+    with pytest.raises(ArgumentError, match=r"expected critic\.action_input=false"):
+        BestControl(Reach1D()).check(Critic(Reach1D(), action_input=True))

@@ -1,0 +1,226 @@
+"""Rates of problems in which they are known, and the time steps that follow from them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from pirl_rl.assembly import choose_time_steps, make_trainer
+from pirl_rl.commands.composition import compose
+from pirl_rl.configuration import load_config, save_config
+from pirl_rl.errors import ArgumentError, ConfigError
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.problems import Reach1D, Safety1D
+from pirl_rl.rates import across_box, across_sets, fastest_rate
+from pirl_rl.sets import Box
+from pirl_rl.simulator import Simulator
+from pirl_rl.time_steps import STEPS, TOLERANCE, propose_time_steps
+
+
+class Linear(ReachAvoidProblem):
+    """dX = (-rates X + U) dt + noise dW in the box [-1, 1]^n times `unit`; the target is far away.
+
+    Args:
+        rates: the n rates of decay, in 1/s.
+        noise: sigma, the same for all coordinates.
+        horizon: T, in s.
+        unit: the length of one in the coordinates of the box.
+    """
+
+    controls = Box([-1.0], [1.0])
+
+    def __init__(self, rates: list[float], noise: float = 0.01, horizon: float = 2.0, unit: float = 1.0):
+        super().__init__(horizon=horizon)
+        self.rates, self.noise, self.unit = torch.tensor(rates, dtype=torch.float64), noise * unit, unit
+        self.states = Box([-unit] * len(rates), [unit] * len(rates))
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return 0.1 * self.unit * u - self.rates.to(x) * x
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        n = x.shape[-1]
+        return (self.noise * torch.eye(n).to(x)).expand(*x.shape, n)
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return 9 - x[..., 0] / self.unit
+
+
+class Faster(Linear):
+    """The same process in a time that runs `pace` times as fast."""
+
+    def __init__(self, pace: float, *arguments, horizon: float = 2.0):
+        super().__init__(*arguments, horizon=horizon / pace)
+        self.pace = pace
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return self.pace * super().drift(x, u)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return self.pace**0.5 * super().diffusion(x, u)
+
+
+class Ball(Linear):
+    """Without rates; the target is a ball that fills 4e-6 of the box."""
+
+    def __init__(self, noise: float, center: float = 0.5):
+        super().__init__([0.0] * 3, noise, horizon=1.0)
+        self.center = center
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.zeros_like(x)
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return 100 * ((x - self.center).norm(dim=-1) - 0.02)
+
+
+def sampled(problem, count: int = 2000):
+    rng = torch.Generator().manual_seed(0)
+    return problem.states.sample(count, rng, torch.float64), problem.controls.sample(count, rng, torch.float64)
+
+
+def test_rates_of_a_linear_system():
+    """The median of |a x| for x uniform in [-1, 1] is a/2: five standard errors of the median, 1/(2 sqrt(N)) each."""
+    problem = Linear([40.0, 1.0], noise=0.3)
+    x, u = sampled(problem)
+    move = across_box(problem, x, u)
+    # The box is two wide, and the control adds 0.1 at most.
+    assert move.speed == pytest.approx(40 / 2 / 2, abs=40 / 2 * 5 / (2 * 2000**0.5) + 0.05)
+    assert move.spread == pytest.approx(0.3 / 2)
+    assert fastest_rate(problem, x, u) == pytest.approx(40, rel=1e-6)
+
+
+def test_rates_of_an_oscillator_and_of_a_chain():
+    class Oscillator(Linear):
+        def drift(self, x, u):
+            return torch.stack([7 * x[..., 1], -7 * x[..., 0]], -1)
+
+    class Chain(Linear):
+        def drift(self, x, u):
+            return torch.stack([x[..., 1], 0 * x[..., 0]], -1)
+
+    for kind, rate in ((Oscillator, 7.0), (Chain, 0.0)):
+        problem = kind([0.0, 0.0])
+        assert fastest_rate(problem, *sampled(problem)) == pytest.approx(rate, abs=1e-3)
+
+
+def test_rates_across_sets_are_those_of_their_depths():
+    """Reach1D: the target starts at 2 and, within twice the box, is 2 deep; the drift is |u| <= 1 and sigma is 1."""
+    (move,) = across_sets(Reach1D(), *sampled(Reach1D()))
+    assert move.across == "the target"
+    assert move.speed == pytest.approx(0.5 / 2, rel=0.1)
+    assert move.spread == pytest.approx(1 / 2, rel=1e-3)
+    # Two faces, each with a set behind it that is 1 deep within twice the box.
+    assert [round(move.spread, 3) for move in across_sets(Safety1D(), *sampled(Safety1D()))] == [1.0, 1.0]
+
+
+@pytest.mark.parametrize("center", [0.0, 0.5, -0.7])
+def test_a_thin_target_is_found_by_descent(center):
+    """Its level is 2 at its center, and changes by 100 times the distance: 0.1 of noise move it by 5 depths in 1 s."""
+    problem = Ball(0.1, center)
+    x, u = sampled(problem, 1000)
+    assert not problem.reached(x).any()
+    (move,) = across_sets(problem, x, u)
+    assert move.spread == pytest.approx(0.1 / 0.02, rel=0.1)
+
+
+def test_a_slow_system_has_the_longest_steps():
+    steps = propose_time_steps(Linear([0.2, 0.1]))
+    assert (steps.dt, steps.substeps) == (2.0 / 20, 1)
+    assert "20 in the horizon" in steps.reason
+    assert "limit" not in steps.reason
+
+
+def test_a_stiff_system_has_substeps_that_resolve_it():
+    """Against exp(-a t): the error of the proposal is accepted, and half as many sub-steps are too few."""
+    problem = Linear([200.0, 1.0])
+    steps = propose_time_steps(problem, dt=0.05)
+    assert steps.dt == 0.05
+    assert steps.substeps >= 0.05 * 200
+    x, u = sampled(problem)
+    a, drive = problem.rates, 0.1 * u
+    decay = torch.exp(-a * 0.05)
+    exact = x * decay + drive / a * (1 - decay)
+    error = (Simulator(problem, 0.05, steps.substeps).flow(x, u) - exact).abs().amax(-1) / 2
+    # Ten times as many sub-steps have a tenth of the error of an Euler scheme, so that the difference is 9/10 of it.
+    assert error.quantile(0.95) <= 1.2 * TOLERANCE
+    half = (Simulator(problem, 0.05, steps.substeps // 2).flow(x, u) - exact).abs().amax(-1) / 2
+    assert steps.substeps // 2 < 0.05 * 200 or half.quantile(0.95) > TOLERANCE
+
+
+def test_a_stiff_system_has_short_control_steps():
+    """Speeds of 50 box widths a second ask for 1 ms, so that the bound of 400 steps holds."""
+    steps = propose_time_steps(Linear([200.0, 1.0]))
+    assert steps.dt == 2.0 / STEPS[-1]
+    assert "more than 400 steps are not proposed" in steps.reason
+
+
+@pytest.mark.parametrize(("noise", "steps"), [(0.3, 20), (1.0, 50), (2.0, 200)])
+def test_noise_moves_a_tenth_of_the_box(noise, steps):
+    """sigma sqrt(dt) <= 0.1 * 2: at most 0.04 s for a sigma of 1."""
+    found = propose_time_steps(Linear([0.0], noise))
+    assert found.dt == 2.0 / steps
+    assert noise * found.dt**0.5 <= 0.2 + 1e-12
+
+
+def test_a_thin_target_limits_the_control_step():
+    """sigma sqrt(dt) <= 0.5 * 0.02: at most 0.01 s for a sigma of 0.1, to the precision of the descent."""
+    found = propose_time_steps(Ball(0.1))
+    assert "across the target limit" in found.reason
+    assert 100 <= 1 / found.dt <= 120
+
+
+@pytest.mark.parametrize("rates", [[0.3, 0.1], [30.0, 1.0]])
+def test_the_choice_depends_on_no_unit(rates):
+    """Neither on the unit of time, nor on that of the state."""
+    base = propose_time_steps(Linear(rates, 0.3))
+    quick = propose_time_steps(Faster(10.0, rates, 0.3))
+    assert 10 * quick.dt == pytest.approx(base.dt)
+    assert quick.substeps == base.substeps
+    long = propose_time_steps(Linear(rates, 0.3, unit=1000.0))
+    assert long[:2] == base[:2]
+
+
+def test_what_is_given_is_kept():
+    problem = Linear([30.0, 1.0])
+    assert propose_time_steps(problem, dt=0.3)[0] == 0.3
+    assert propose_time_steps(problem, substeps=3)[1] == 3
+    assert propose_time_steps(problem, dt=0.3, substeps=3)[:2] == (0.3, 3)
+    with pytest.raises(ArgumentError, match="dt: expected 0 < dt <= horizon"):
+        propose_time_steps(problem, dt=3.0)
+    with pytest.raises(ArgumentError, match="substeps: expected an integer >= 1"):
+        propose_time_steps(problem, substeps=0)
+
+
+def own(*overrides: str):
+    return compose("train", ["+experiment=own", "env.problem._target_=pirl_rl.problems.Safety1D", *overrides])
+
+
+def test_auto_is_replaced_by_numbers_that_are_printed_and_kept(tmp_path, capsys):
+    """Safety1D: sigma of 1 in a box two wide asks for 0.04 s. Evaluators and readers see the numbers."""
+    config = own("logger=none")
+    assert (config.env.dt, config.env.substeps) == ("auto", "auto")
+    trainer = make_trainer(config)
+    assert (config.env.dt, config.env.substeps) == (0.04, 1)
+    assert (config.evaluation.simulator.dt, config.evaluation.simulator.substeps) == (0.04, 1)
+    assert trainer.simulator.dt == trainer.collector.env.simulator.dt == 0.04
+    assert "time: Control step 0.04 s, 50 in the horizon, with 1 integration step." in capsys.readouterr().out
+    save_config(config, tmp_path)
+    assert "auto" not in str(load_config(tmp_path).env)
+    make_trainer(load_config(tmp_path))
+    assert "time:" not in capsys.readouterr().out
+
+
+def test_a_number_beside_auto_is_kept(capsys):
+    config = own("env.dt=0.3")
+    choose_time_steps(config, Safety1D())
+    assert (config.env.dt, config.env.substeps) == (0.3, 1)
+    config = own("env.substeps=3")
+    choose_time_steps(config, Safety1D())
+    assert (config.env.dt, config.env.substeps) == (0.04, 3)
+    capsys.readouterr()
+    config = own("env.dt=0.3", "env.substeps=2")
+    choose_time_steps(config, Safety1D())
+    assert capsys.readouterr().out == ""
+    with pytest.raises(ConfigError, match=r"env\.dt: expected float, got 'soon'"):
+        choose_time_steps(own("env.dt=soon"), Safety1D())
