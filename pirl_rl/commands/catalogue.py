@@ -44,7 +44,7 @@ def catalogue() -> str:
 
 
 def _table(title: str, rows: list[tuple[str, str]]) -> str:
-    return "\n".join([title, *(f"  {name:<16} {meaning}".rstrip() for name, meaning in rows)])
+    return "\n".join([title, *(f"  {name:<17} {meaning}".rstrip() for name, meaning in rows)])
 
 
 def _first_line(cls: type) -> str:

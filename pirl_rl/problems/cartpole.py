@@ -19,7 +19,7 @@ from pirl_rl.sets import Box, Plane
 
 
 class CartPole(ReachAvoidProblem):
-    """Keep |p| < 2.4 m and |theta| < 12 degrees for T = 2 s with a force of at most 10 N against gusts on cart and pole."""
+    """Keep |p| < 2.4 m and |theta| < 12 degrees for T = 2 s by a force of at most 10 N, in gusts on cart and pole."""
 
     objective = "invariance"
     horizon = 2.0

@@ -16,7 +16,7 @@ from pirl_rl.sets import Box, Plane
 
 
 class DoubleIntegrator(ReachAvoidProblem):
-    """dp = v dt + noise, dv = u dt + noise, |u| <= 1: come to rest at the origin within T = 3 s, |p|, |v| < 1 until then.
+    """dp = v dt + noise, dv = u dt + noise, |u| <= 1: come to rest at p = 0 in T = 3 s, with |p|, |v| < 1 until then.
 
     The target is the box |p| <= 0.2, |v| <= 0.2.
 

@@ -20,7 +20,7 @@ class DubinsCar(ReachAvoidProblem):
     """Drive at 1 m/s with a turn rate of at most 1.5 rad/s into a disc within T = 4 s, past a rock and inside walls."""
 
     horizon = 4.0
-    states = Box([-2.0, -2.0, -math.pi], [2.0, 2.0, math.pi])
+    states = Box([-2.0, -2.0, -math.pi], [2.0, 2.0, math.pi], periodic=[2])
     controls = Box([-1.5], [1.5])
     speed = 1.0  # m/s
     noise = (0.1, 0.1, 0.3)  # m, m and rad per sqrt(s)

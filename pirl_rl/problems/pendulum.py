@@ -32,9 +32,7 @@ class Pendulum(ReachAvoidProblem):
 
     def drift(self, x: Tensor, u: Tensor) -> Tensor:
         theta, omega = x.unbind(-1)
-        acceleration = (
-            3 * self.gravity / (2 * self.length) * theta.sin() + 3 / (self.mass * self.length**2) * u[..., 0]
-        )
+        acceleration = 3 * self.gravity / (2 * self.length) * theta.sin() + 3 / (self.mass * self.length**2) * u[..., 0]
         return torch.stack([omega, acceleration], -1)
 
     def diffusion(self, x: Tensor, u: Tensor) -> Tensor:

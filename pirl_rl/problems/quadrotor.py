@@ -27,7 +27,7 @@ class PlanarQuadrotor(ReachAvoidProblem):
     arm = 0.25  # m, from the centre to a rotor
     inertia = 0.00383  # kg m^2
     states = Box([-2.0, 0.0, -1.0, -2.0, -2.0, -5.0], [2.0, 2.0, 1.0, 2.0, 2.0, 5.0])
-    controls = Box([0.0, 0.0], [mass * gravity, mass * gravity])  # both rotors lift twice the weight at most
+    controls = Box([0.0, 0.0], [mass * gravity, mass * gravity])  # each rotor lifts at most the weight
     hover = (0.0, 1.0, 0.0, 0.0, 0.0, 0.0)  # the middle of the target
     tolerances = (0.3, 0.3, 0.2, 0.5, 0.5, 1.5)  # half of the target's widths
     limits = (2.0, 1.0, 1.2)  # m, m and rad, of |x|, |z - 1| and |theta|; B is beyond
@@ -54,14 +54,13 @@ class PlanarQuadrotor(ReachAvoidProblem):
     def faces(self, count: int, rng: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         """Points (count, 6) and values (count,): half on the faces of A, half on those of B.
 
+        They are given here because the target is too thin to be found by sampling.
         There is no noise on position and angle, so V takes the set's value on a face of those only where the rate leads
         into the set, and only such points are drawn.
         """
         half = count // 2
         offsets = 2 * torch.rand(count, 6, generator=rng, dtype=torch.float64) - 1
-        side = torch.cat(
-            [torch.randint(6, (half,), generator=rng), torch.randint(3, (count - half,), generator=rng)]
-        )
+        side = torch.cat([torch.randint(6, (half,), generator=rng), torch.randint(3, (count - half,), generator=rng)])
         rows, target = torch.arange(count), torch.arange(count) < half
         sign = torch.where(offsets[rows, side] < 0, -1.0, 1.0).double()
         offsets[rows, side] = sign

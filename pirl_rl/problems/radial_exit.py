@@ -8,7 +8,6 @@ Sec. 3.3.C, with two more terms of drift, and one partial differential equation 
 from __future__ import annotations
 
 import math
-from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -51,6 +50,9 @@ class RadialExit(ReachAvoidProblem):
         half_width = math.sqrt(3)  # the mean square of a coordinate that is uniform in the box is 1
         self.states = Box([-half_width] * dim, [half_width] * dim)
         self.inner, self.outer = math.sqrt(dim) - 1, math.sqrt(dim) + 1
+        self._radial_value = IntervalExit(
+            lambda r: -2 * r - r**2 / 2 + (dim - 1) * torch.log(r), self.inner, self.outer
+        )
 
     def drift(self, x: Tensor, u: Tensor) -> Tensor:
         # Inside the target the direction x/|x| is shortened, so that it is defined at the origin.
@@ -74,11 +76,6 @@ class RadialExit(ReachAvoidProblem):
 
     def optimal_control(self, tau: Tensor, x: Tensor) -> Tensor:
         return -torch.ones_like(x[..., :1])
-
-    @cached_property
-    def _radial_value(self) -> IntervalExit:
-        n = self.states.dim
-        return IntervalExit(lambda r: -2 * r - r**2 / 2 + (n - 1) * torch.log(r), self.inner, self.outer)
 
     @property
     def planes(self) -> dict[str, Plane]:
