@@ -1,17 +1,16 @@
 """The Markov chain of each candidate control: its jump rates between nodes and into A and B.
 
-Along an offset v of the mesh let p and q in (0, 1] be the fractions of v and of -v that a straight path covers before
-it enters A or B; they are 1 where it does not. With D = sum_k lambda_k v_k v_k^T the rates forward and backward are
+The covariance per unit of time, in units of the mesh, is a sum of lambda_k v_k v_k^T over whole offsets v_k, see
+`pirl_rl.grid.stencil`. Let p and q in (0, 1] be the fractions of v_k and of -v_k that a straight path covers before it
+enters A or B; they are 1 where it does not. The rates forward and backward are
 
-    lambda / (p (p + q)),   lambda / (q (p + q)),
+    lambda_k (1 + c_k q) / (p (p + q)),   lambda_k (1 - c_k p) / (q (p + q)),
 
-the second difference with unequal arms of G. Shortley and R. Weller (Journal of Applied Physics 9, 1938): faces of A and
-B lie where the level functions have them, not at nodes. Along an axis with the drift F, in units of the mesh, they are
-
-    (a + F q) / (p (p + q)),   (a - F p) / (q (p + q))   with   a = max(lambda, F p, -F q).
-
-These are central differences where the noise is strong enough, and else upwind differences: a - lambda is the least
-artificial noise with rates >= 0. Both have the drift F exactly.
+second differences with unequal arms (G. Shortley and R. Weller, Journal of Applied Physics 9, 1938), so that faces of A
+and B lie where the level functions have them, not at nodes. They have the drift c_k lambda_k v_k. With c_k = v_k . D^-1 F
+these drifts add up to the drift F. Since rates must not be negative, c_k is limited to [-1/q, 1/p]. What then is left
+of F moves along the axes, as an upwind difference: the rate |R_i| / p for the rest R_i > 0, with p of the arm along R_i.
+Thus the scheme has central differences, of second order, where the noise is strong enough, and is of first order else.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ import torch
 from scipy import sparse
 
 from pirl_rl.grid.mesh import Mesh, absorbed
-from pirl_rl.grid.stencil import decompose
+from pirl_rl.grid.stencil import bounded, decompose
 from pirl_rl.problem import ReachAvoidProblem, has_controlled_noise
 
 LOOKS = 4
@@ -52,6 +51,18 @@ class Arm(NamedTuple):
     value: np.ndarray
 
 
+class Noise(NamedTuple):
+    """The covariance of the noise per unit of time, in units of the mesh.
+
+    Attributes:
+        inverse: D^-1 (M, n, n), or (1, n, n) if it is the same at all nodes.
+        directions: weight (M,) or (1,), offset (M, n) or (1, n), and the arms forward and backward, for each v_k.
+    """
+
+    inverse: np.ndarray
+    directions: list[tuple[np.ndarray, np.ndarray, Arm, Arm]]
+
+
 class Chain:
     """The chains of all candidates on the nodes outside A and B.
 
@@ -78,7 +89,7 @@ class Chain:
             drift = problem.drift(x, control).numpy() / mesh.spacing
             if noise is None or has_controlled_noise(problem):
                 noise = self._noise(problem.diffusion(x, control).numpy())
-            rates, gain = self._assembled(drift, *noise)
+            rates, gain = self._assembled(drift, noise)
             blocks.append(rates)
             gains.append(gain)
         self._rates: sparse.csr_array = sparse.vstack(blocks, format="csr")
@@ -116,34 +127,35 @@ class Chain:
         fraction[cut] = np.maximum(far, SHORTEST)
         return Arm(fraction, mesh.flat(self._at + offsets), cut, value)
 
-    def _noise(self, sigma: np.ndarray) -> tuple[np.ndarray, list[tuple[np.ndarray, Arm, Arm]]]:
-        """The noise along the axes (M, n), and the weights (M,) and arms of the oblique offsets."""
+    def _noise(self, sigma: np.ndarray) -> Noise:
+        """The noise of sigma (M, n, w)."""
         scaled = sigma / self._mesh.spacing[:, None]
         covariance = scaled @ scaled.swapaxes(-2, -1)
-        constant = (covariance == covariance[:1]).all()
-        weights, offsets = decompose(covariance[:1] if constant else covariance, 1 / max(self._mesh.shape))
-        if constant:
-            weights, offsets = (np.repeat(entry, len(covariance), 0) for entry in (weights, offsets))
-        along = np.zeros_like(covariance[..., 0])
-        oblique = []
+        constant = bool((covariance == covariance[:1]).all())
+        covariance = bounded(covariance[:1] if constant else covariance, 1 / max(self._mesh.shape))
+        weights, offsets = decompose(covariance)
+        # An axis without noise has no inverse; with this small addition its c_k are beyond every limit.
+        trace = np.trace(covariance, axis1=-2, axis2=-1)[:, None, None]
+        inverse = np.linalg.inv(covariance + (1e-9 * trace + 1e-30) * np.eye(covariance.shape[-1]))
+        directions = []
         for weight, offset in zip(weights.T, offsets.swapaxes(0, 1), strict=True):
-            straight = np.abs(offset).sum(-1) == 1
-            along += np.abs(offset) * (weight * straight)[:, None]
-            rest = np.where(straight, 0.0, weight)
-            if rest.any():
-                oblique.append((rest, self._arm(offset), self._arm(-offset)))
-        return along, oblique
+            if weight.any():
+                directions.append((weight, offset, self._arm(offset), self._arm(-offset)))
+        return Noise(inverse, directions)
 
-    def _assembled(self, drift: np.ndarray, along: np.ndarray, oblique) -> tuple[sparse.csr_array, np.ndarray]:
+    def _assembled(self, drift: np.ndarray, noise: Noise) -> tuple[sparse.csr_array, np.ndarray]:
         """The rates (M, M) and the gain (M,) of one candidate with its drift (M, n), in units of the mesh per s."""
-        jumps = []
-        for axis, (forward, backward) in enumerate(self.axes):
-            p, q, speed = forward.fraction, backward.fraction, drift[:, axis]
-            noise = np.maximum(along[:, axis], np.maximum(speed * p, -speed * q))
-            jumps += [(forward, (noise + speed * q) / (p * (p + q))), (backward, (noise - speed * p) / (q * (p + q)))]
-        for weight, forward, backward in oblique:
+        jumps, rest = [], drift.copy()
+        slope = np.einsum("pij,pj->pi", np.broadcast_to(noise.inverse, (len(drift), *noise.inverse.shape[1:])), drift)
+        for weight, offset, forward, backward in noise.directions:
             p, q = forward.fraction, backward.fraction
-            jumps += [(forward, weight / (p * (p + q))), (backward, weight / (q * (p + q)))]
+            share = (offset * slope).sum(-1).clip(-1 / q, 1 / p)
+            jumps.append((forward, weight * (1 + share * q) / (p * (p + q))))
+            jumps.append((backward, weight * (1 - share * p) / (q * (p + q))))
+            rest -= (share * weight)[:, None] * offset
+        for axis, (forward, backward) in enumerate(self.axes):
+            jumps.append((forward, rest[:, axis].clip(0) / forward.fraction))
+            jumps.append((backward, (-rest[:, axis]).clip(0) / backward.fraction))
         size = len(drift)
         gain, out = np.zeros(size), np.zeros(size)
         rows, columns, rates = [], [], []

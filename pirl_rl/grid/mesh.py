@@ -14,9 +14,11 @@ import torch
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
 
-DEVIATIONS = 2.0
-"""Number of standard deviations by which the box is widened: a path that goes so far and comes back has covered four of
-them, which has a probability of 3e-5."""
+DEVIATIONS = 3.0
+"""Number of standard deviations by which the box is widened. A path that goes so far and comes back covers six."""
+
+WIDEST = {1: 1.0, 2: 1.0, 3: 0.5}
+"""The largest margin on a side, in widths of `states`, by the number of states: in three dimensions it costs most."""
 
 
 class Mesh:
@@ -78,7 +80,7 @@ def default_margin(problem: ReachAvoidProblem, samples: int = 4096) -> np.ndarra
     """How far (n,) the box is widened on each side, in SI units, from drift and noise at sampled states and controls.
 
     It is the way that the drift goes out and back within the horizon and `DEVIATIONS` standard deviations of the noise,
-    but at most half the width of `states`, and 0 on periodic axes.
+    but at most `WIDEST`, and 0 on periodic axes.
     """
     rng = torch.Generator().manual_seed(0)
     x = problem.states.sample(samples, rng, torch.float64)
@@ -86,7 +88,8 @@ def default_margin(problem: ReachAvoidProblem, samples: int = 4096) -> np.ndarra
     speed = problem.drift(x, u).abs().amax(0).numpy()
     noise = problem.diffusion(x, u).norm(dim=-1).amax(0).numpy()
     margin = speed * problem.horizon / 2 + DEVIATIONS * noise * problem.horizon**0.5
-    margin = np.minimum(margin, (np.array(problem.states.high) - problem.states.low) / 2)
+    width = np.array(problem.states.high) - problem.states.low
+    margin = np.minimum(margin, WIDEST[problem.states.dim] * width)
     margin[list(problem.states.periodic)] = 0.0
     return margin
 

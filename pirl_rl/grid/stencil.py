@@ -18,16 +18,11 @@ SWEEPS = 200
 """Largest number of steps of the reduction. Their number grows with the logarithm of the condition number of D."""
 
 
-def decompose(covariance: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
+def decompose(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Weights and offsets whose sum is the covariance.
-
-    An oblique direction of noise in a degenerate D may need offsets without bound. Hence, where D is not diagonal,
-    `least` times its trace is added to its diagonal: the offsets have at most about 1 / sqrt(least) nodes, and the
-    error is of order `least`.
 
     Args:
         covariance: D (P, n, n), positive semidefinite, in units of the mesh: (sigma sigma^T)_ij / (dx_i dx_j).
-        least: the share of the trace, >= 0.
 
     Returns:
         Weights (P, k), >= 0, in the units of D, and whole offsets (P, k, n), with k = n (n + 1) / 2.
@@ -35,10 +30,6 @@ def decompose(covariance: np.ndarray, least: float) -> tuple[np.ndarray, np.ndar
     size = covariance.shape[-1]
     if size == 1:
         return covariance[:, :, 0], np.ones((len(covariance), 1, 1), int)
-    diagonal = covariance * np.eye(size)
-    oblique = (covariance != diagonal).any((-2, -1))
-    added = least * oblique * np.trace(covariance, axis1=-2, axis2=-1)
-    covariance = covariance + added[:, None, None] * np.eye(size)
     base = _reduced(covariance)
     weights, offsets = [], []
     for i, j in combinations(range(size + 1), 2):
@@ -46,6 +37,23 @@ def decompose(covariance: np.ndarray, least: float) -> tuple[np.ndarray, np.ndar
         weights.append(np.maximum(-_product(base, covariance, i, j), 0.0))
         offsets.append(np.stack([-rest[0][:, 1], rest[0][:, 0]], -1) if size == 2 else np.cross(*rest))
     return np.stack(weights, 1), np.stack(offsets, 1)
+
+
+def bounded(covariance: np.ndarray, least: float) -> np.ndarray:
+    """The covariance D (P, n, n) with so much added to its diagonal that its offsets are bounded.
+
+    Noise in one oblique direction alone may need offsets without bound. Hence, where D is not diagonal, its smallest
+    eigenvalue is raised to `least` times its trace, on the axes that have noise. The offsets then have at most about
+    1 / sqrt(least) nodes, and D changes by at most `least` times its trace.
+    """
+    diagonal = np.einsum("pii->pi", covariance)
+    trace, noisy = diagonal.sum(-1), diagonal > 0
+    oblique = (np.abs(covariance).sum((-2, -1)) > trace * (1 + 1e-12))[:, None]
+    identity = np.eye(covariance.shape[-1])
+    # Axes without noise are given some, so that they do not determine the smallest eigenvalue.
+    smallest = np.linalg.eigvalsh(covariance + (trace[:, None] * ~noisy)[:, None] * identity)[:, :1]
+    lack = np.maximum(least * trace[:, None] - smallest, 0.0) * (oblique & noisy)
+    return covariance + lack[:, None] * identity
 
 
 def _reduced(covariance: np.ndarray) -> np.ndarray:
