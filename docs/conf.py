@@ -73,8 +73,11 @@ reference_rooms = {
             "pirl_rl.problems.drift.reference_states",
         ],
     ),
-    "numerics": ("Simulator and operators", ["pirl_rl.simulator", "pirl_rl.operators", "pirl_rl.internals"]),
-    "networks": ("Networks and schedules", ["pirl_rl.networks", "pirl_rl.schedules"]),
+    "numerics": (
+        "Simulator and operators",
+        ["pirl_rl.simulator", "pirl_rl.clock", "pirl_rl.operators", "pirl_rl.internals"],
+    ),
+    "networks": ("Networks and schedules", ["pirl_rl.networks", "pirl_rl.layers", "pirl_rl.schedules"]),
     "sampling": (
         "States and points",
         ["pirl_rl.sampling.initial_states", "pirl_rl.sampling.collocation", "pirl_rl.sampling.boundary"],
@@ -122,6 +125,7 @@ reference_rooms = {
             "pirl_rl.evaluation.inputs",
             "pirl_rl.evaluation.exact_error",
             "pirl_rl.evaluation.residuals",
+            "pirl_rl.evaluation.largest_residual",
             "pirl_rl.evaluation.success",
             "pirl_rl.evaluation.calibration",
             "pirl_rl.evaluation.accuracy",

@@ -2,7 +2,8 @@
 
 A TensorDict contains a batch of N paths:
 
-- "tau" (N, 1): the time to go, in s, which is a part of the state;
+- "tau" (N, 1): the time to go, in s, which is a part of the state. Every step is dt long but the last of an episode,
+  which is shorter where dt does not divide tau and ends at tau = 0;
 - "state" (N, n): the state x, in SI units;
 - "action" (N, m): the control, normalised to [-1, 1];
 - "is_init" (N, 1): whether the state is the first of its episode;
@@ -65,7 +66,7 @@ class ReachAvoidEnv(EnvBase):
         self.problem = problem
         self.simulator = Simulator(problem, dt, substeps, crossing)  # type: ignore[arg-type]
         self.initial_states: InitialStates = initial_states or UniformStates()
-        self.max_steps = round(problem.horizon / dt)
+        self.max_steps = self.simulator.clock.max_steps
         self._make_specs()
         self.rng = torch.Generator(device=self.device)
         self.set_seed(int(torch.empty((), dtype=torch.int64).random_().item()) if seed is None else seed)
@@ -100,10 +101,11 @@ class ReachAvoidEnv(EnvBase):
         steps, state = self.initial_states.sample(
             self.problem, self.batch_size[0], self.max_steps, self.rng, torch.get_default_dtype(), visited
         )
+        state = self.problem.states.wrap(state)
         none = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
         return TensorDict(
             {
-                "tau": (steps * self.simulator.dt).to(state.dtype).unsqueeze(-1),
+                "tau": self.simulator.clock.time(steps).to(state.dtype).unsqueeze(-1),
                 "state": state,
                 "is_init": ~none,
                 "done": none,
@@ -114,15 +116,14 @@ class ReachAvoidEnv(EnvBase):
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        tau, dt = tensordict["tau"], self.simulator.dt
-        # Rounding to whole steps to go keeps the errors of tau from adding or dropping a step.
-        steps = torch.round(tau / dt) - 1
+        tau, x, clock = tensordict["tau"], tensordict["state"], self.simulator.clock
+        steps, shortfall = clock.split(tau)
         u = self.problem.controls.denormalize(tensordict["action"])
-        step = self.simulator.step(tensordict["state"], u, self.rng)
-        terminated = (step.reached | step.failed).unsqueeze(-1) | (steps <= 0)
+        step = self.simulator.step(x, u, self.rng, dt=clock.length(steps, shortfall).squeeze(-1).to(x))
+        terminated = (step.reached | step.failed).unsqueeze(-1) | (steps <= 1)
         return TensorDict(
             {
-                "tau": (steps * dt).clamp(min=0),
+                "tau": clock.time(steps - 1, shortfall).to(tau),
                 "state": step.state,
                 "is_init": torch.zeros_like(terminated),
                 "reward": exit_value(self.problem, step).unsqueeze(-1) * terminated,

@@ -1,5 +1,7 @@
 """Actor and critics: multilayer perceptrons whose first layer scales the inputs to [-1, 1].
 
+They take the sine and the cosine of a periodic coordinate, so that they have its period exactly, with all derivatives.
+
 The parameters may have leading axes, over which `forward` broadcasts. With weights stacked as (critics, out, in), as in
 TorchRL's losses, one call evaluates all critics and returns (critics, N, 1).
 """
@@ -14,60 +16,12 @@ import torch
 from torch import Tensor, nn
 
 from pirl_rl.errors import ArgumentError
+from pirl_rl.layers import Dense, Periodic, RootTime, Scaling
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sets import Box
 
 ROOT_TIME_OFFSET = 1e-4
 """tau_0 of `RootTime` as a fraction of the horizon."""
-
-
-class Dense(nn.Linear):
-    """x W^T + b (*, N, out) of x (*, N, in); weight (*, out, in) and bias (*, out) may be stacked."""
-
-    def forward(self, input: Tensor) -> Tensor:
-        return torch.matmul(input, self.weight.mT) + self.bias.unsqueeze(-2)
-
-
-class Scaling(nn.Module):
-    """The affine map of the box [low, high] to [-1, 1]^d, for inputs (*, N, d).
-
-    As a layer it needs no scaled copy of the physics: derivatives in physical units follow by the chain rule.
-
-    Args:
-        low: lower corner, d numbers.
-        high: upper corner, d numbers.
-    """
-
-    scale: Tensor
-    shift: Tensor
-
-    def __init__(self, low: Sequence[float], high: Sequence[float]):
-        super().__init__()
-        low_, high_ = torch.as_tensor(low, dtype=torch.float64), torch.as_tensor(high, dtype=torch.float64)
-        scale = 2 / (high_ - low_)
-        self.register_buffer("scale", scale.to(torch.get_default_dtype()))
-        self.register_buffer("shift", (-(low_ + high_) / 2 * scale).to(torch.get_default_dtype()))
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x * self.scale.unsqueeze(-2) + self.shift.unsqueeze(-2)
-
-
-class RootTime(nn.Module):
-    """Appends sqrt(tau + tau_0) to inputs (*, d) whose first entry is the time to go tau.
-
-    Where the boundary data jump at tau = 0, V varies over a width proportional to sqrt(tau). As a function of the root
-    of time that is a wedge, which a small network can represent up to tau = 0.
-
-    Args:
-        tau_0: in s, above 0; it bounds the slope 1/(2 sqrt(tau + tau_0)) at tau = 0.
-    """
-
-    def __init__(self, tau_0: float):
-        super().__init__()
-        self.tau_0 = tau_0
-
-    def forward(self, x: Tensor) -> Tensor:
-        return torch.cat([x, torch.sqrt(x[..., :1] + self.tau_0)], -1)
 
 
 def _stack(
@@ -78,10 +32,10 @@ def _stack(
     activation: str,
     output: str | None,
     root_time: bool,
-    box: Box,
+    scaling: Box | None,
 ) -> nn.Sequential:
-    low, high = (0.0, *box.low), (problem.horizon, *box.high)
-    low, high = (*low, *[-1.0] * controls), (*high, *[1.0] * controls)
+    box = _with_periods(scaling or problem.states, problem.states)
+    low, high = (0.0, *box.low, *[-1.0] * controls), (problem.horizon, *box.high, *[1.0] * controls)
     layers: list[nn.Module] = []
     if root_time:
         tau_0 = ROOT_TIME_OFFSET * problem.horizon
@@ -89,10 +43,22 @@ def _stack(
         low, high = (*low, tau_0**0.5), (*high, (problem.horizon + tau_0) ** 0.5)
     layers.append(Scaling(low, high))
     width = len(low)
+    if box.periodic:
+        # The time to go is the first input.
+        layers.append(Periodic(width, [1 + axis for axis in box.periodic]))
+        width += len(box.periodic)
     for wide in hidden:
         layers += [Dense(width, wide), _activation("activation", activation)]
         width = wide
     return nn.Sequential(*layers, Dense(width, outputs), *([] if output is None else [_activation("output", output)]))
+
+
+def _with_periods(box: Box, states: Box) -> Box:
+    """The box with the periodic axes of `states` in place of its own."""
+    low, high = list(box.low), list(box.high)
+    for axis in states.periodic:
+        low[axis], high[axis] = states.low[axis], states.high[axis]
+    return Box(low, high, states.periodic)
 
 
 def _activation(argument: str, name: str) -> nn.Module:
@@ -121,7 +87,8 @@ class Actor(nn.Module):
         problem: gives the numbers of states and controls, and the horizon.
         hidden: widths of the hidden layers.
         activation: name of a layer of `torch.nn`.
-        scaling: box of states that the first layer maps to [-1, 1]^n; default `problem.states`.
+        scaling: box of states that the first layer maps to [-1, 1]^n; default `problem.states`, which gives the periods
+            of periodic axes in any case.
 
     Raises:
         ArgumentError: `activation` is not the name of a layer of `torch.nn`.
@@ -135,8 +102,8 @@ class Actor(nn.Module):
         scaling: Box | None = None,
     ):
         super().__init__()
-        box = scaling or problem.states
-        self.layers = _stack(problem, 0, hidden, problem.controls.dim, activation, "Tanh", root_time=False, box=box)
+        outputs = problem.controls.dim
+        self.layers = _stack(problem, 0, hidden, outputs, activation, "Tanh", root_time=False, scaling=scaling)
 
     def logits(self, tau: Tensor, state: Tensor) -> Tensor:
         """The output (N, m) before the hyperbolic tangent of the last layer."""
@@ -158,7 +125,8 @@ class Critic(nn.Module):
         root_time: whether sqrt(tau) is an input beside tau, see `RootTime`.
         output: "Sigmoid" keeps the output in (0, 1), as in the paper, but attains 0 or 1 at a face only in the limit of
             infinite weights. None is a linear output, which attains both.
-        scaling: box of states that the first layer maps to [-1, 1]^n; default `problem.states`.
+        scaling: box of states that the first layer maps to [-1, 1]^n; default `problem.states`, which gives the periods
+            of periodic axes in any case.
 
     Raises:
         ArgumentError: `activation` or `output` is not the name of a layer of `torch.nn`.
@@ -177,7 +145,7 @@ class Critic(nn.Module):
         super().__init__()
         self.action_input = action_input
         controls = problem.controls.dim if action_input else 0
-        self.layers = _stack(problem, controls, hidden, 1, activation, output, root_time, scaling or problem.states)
+        self.layers = _stack(problem, controls, hidden, 1, activation, output, root_time, scaling)
         _xavier(self.layers)
 
     def inputs(self, tau: Tensor, state: Tensor, action: Tensor) -> Tensor:

@@ -7,7 +7,8 @@ activation z of a network is an Ito process dz = a dt + s dW by Ito's lemma. The
 a = (-1, f) and one column s_j = (0, sigma_j) for each of the w noise channels. The layers map (z, a, s) as follows:
 
 - an affine layer applies its weights to z, a and s, and its bias to z alone;
-- an activation phi gives (phi(z), phi'(z) a + 1/2 phi''(z) |s|^2, phi'(z) s).
+- an activation phi gives (phi(z), phi'(z) a + 1/2 phi''(z) |s|^2, phi'(z) s); so do the sine and the cosine of a
+  periodic coordinate.
 
 The drift of the output is L^u V. This costs as much as 2 + w forward passes and builds no graph of derivatives, so that
 it can be compiled and one backward pass gives the gradient in the parameters, through the Hessian too. Other callables
@@ -22,7 +23,8 @@ import torch
 from torch import Tensor, nn
 
 from pirl_rl.errors import ArgumentError
-from pirl_rl.networks import CriticValue, Dense, RootTime, Scaling
+from pirl_rl.layers import Dense, Periodic, RootTime, Scaling
+from pirl_rl.networks import CriticValue
 from pirl_rl.problem import ReachAvoidProblem
 
 ValueFunction = Callable[[Tensor, Tensor], Tensor]
@@ -113,7 +115,11 @@ def _propagate(layer: nn.Module, z: Tensor, a: Tensor, s: Tensor) -> tuple[Tenso
         weight = layer.weight.mT
         columns = torch.matmul(s.flatten(-3, -2), weight).unflatten(-2, s.shape[-3:-1])
         return layer(z), torch.matmul(a, weight), columns
-    y, slope, curvature = ACTIVATIONS[type(layer)](z)
+    if isinstance(layer, Periodic):
+        z, a, s = layer.widened(z), layer.widened(a), layer.widened(s)
+        y, slope, curvature = layer.waves(z)
+    else:
+        y, slope, curvature = ACTIVATIONS[type(layer)](z)
     return y, slope * a + curvature * s.square().sum(-3) / 2, slope.unsqueeze(-3) * s
 
 
@@ -135,7 +141,7 @@ def require_twice_differentiable(layers: nn.Sequential) -> None:
         ArgumentError: an activation is not one of `ACTIVATIONS`.
     """
     for layer in layers:
-        if not isinstance(layer, (RootTime, Scaling, Dense)) and type(layer) not in ACTIVATIONS:
+        if not isinstance(layer, (RootTime, Scaling, Periodic, Dense)) and type(layer) not in ACTIVATIONS:
             known = ", ".join(sorted(kind.__name__ for kind in ACTIVATIONS))
             raise ArgumentError(
                 f"critic: the HJB residual takes second derivatives, so every activation must be C^2; "

@@ -33,7 +33,9 @@ class ReachAvoidProblem(ABC):
 
     Attributes:
         horizon: T > 0, in s.
-        states: the box of states for sampling and scaling. Nothing is clipped, absorbed or imposed at its edge.
+        states: the box of states for sampling and scaling. Nothing is clipped, absorbed or imposed at its edge. An
+            angle is a periodic axis of it, `Box(low, high, periodic=[axis])`. The methods of a problem are called with
+            periodic coordinates in [low, high), and their results must agree at both ends of the period.
         controls: the box of admissible controls. The entry `action` of a TensorDict is the control in the coordinates
             in which this box is [-1, 1]^m.
         objective: "reach-avoid", or "invariance", where only B absorbs and V(0, x) = 1 outside B.
@@ -171,6 +173,13 @@ def _normalized(levels, x: Tensor) -> Tensor:
     return value / torch.where(slope > 0, slope, torch.ones_like(slope))
 
 
+PERIOD_POINTS = 1_000
+"""The number of states at which both ends of a period are compared."""
+
+PERIOD_TOLERANCE = 1e-4
+"""The relative difference at both ends of a period that counts as rounding, also of a function in single precision."""
+
+
 def check_problem(problem: ReachAvoidProblem, points: int = 100_000, seed: int = 0) -> None:
     """Refuse a problem whose parts are missing, have wrong shapes, or contradict each other.
 
@@ -180,8 +189,8 @@ def check_problem(problem: ReachAvoidProblem, points: int = 100_000, seed: int =
         seed: the seed of these states.
 
     Raises:
-        ProblemError: an attribute is missing, the horizon is not positive, an output has the wrong shape, or a sampled
-            state lies in both A and B.
+        ProblemError: an attribute is missing, the horizon is not positive, a control is periodic, an output has the
+            wrong shape or differs at both ends of a period, or a sampled state lies in both A and B.
     """
     name = type(problem).__name__
     for attribute in ("horizon", "states", "controls"):
@@ -189,6 +198,8 @@ def check_problem(problem: ReachAvoidProblem, points: int = 100_000, seed: int =
             raise ProblemError(f"{name} has no {attribute}")
     if not problem.horizon > 0:
         raise ProblemError(f"{name}: horizon must be positive, got {problem.horizon}")
+    if problem.controls.periodic:
+        raise ProblemError(f"{name}.controls: only states may be periodic, got {problem.controls}")
     rng = torch.Generator().manual_seed(seed)
     x = problem.states.expand(1.5).sample(points, rng, dtype=torch.float64)
     u = problem.controls.sample(16, rng, dtype=torch.float64)
@@ -207,6 +218,29 @@ def check_problem(problem: ReachAvoidProblem, points: int = 100_000, seed: int =
             raise ProblemError(
                 f"{name}: target and avoid set overlap, expected disjoint sets; {int(both.sum())} of {points} "
                 f"sampled points lie in both, for example x = {point}"
+            )
+    for axis in problem.states.periodic:
+        _expect_period(problem, axis, x[:PERIOD_POINTS], problem.controls.sample(PERIOD_POINTS, rng, torch.float64))
+
+
+def _expect_period(problem: ReachAvoidProblem, axis: int, x: Tensor, u: Tensor) -> None:
+    """Refuse functions that differ at both ends of a periodic axis, at the other coordinates of x (N, n)."""
+    low, high = x.clone(), x.clone()
+    low[:, axis], high[:, axis] = problem.states.low[axis], problem.states.high[axis]
+    functions = {
+        "drift": problem.drift,
+        "diffusion": problem.diffusion,
+        # The levels may differ there, as long as the sets do not.
+        "membership of the target": lambda x, u: problem.reached(x).double(),
+        "membership of the avoid set": lambda x, u: problem.failed(x).double(),
+    }
+    for what, function in functions.items():
+        one, other = function(low, u), function(high, u)
+        if not torch.allclose(one, other, rtol=PERIOD_TOLERANCE, atol=PERIOD_TOLERANCE * float(one.abs().max())):
+            raise ProblemError(
+                f"{type(problem).__name__}: axis {axis} of states is periodic, so its {what} must be the same at both "
+                f"ends of the period, {problem.states.low[axis]:g} and {problem.states.high[axis]:g}, got a difference "
+                f"of up to {float((one - other).abs().max()):g}"
             )
 
 

@@ -19,15 +19,20 @@ from pirl_rl.errors import ArgumentError
 class Box:
     """The box {x : low <= x <= high} in R^n, in the units of the problem.
 
+    A periodic axis, such as that of an angle, is a circle: coordinates that differ by a multiple of the period
+    high - low are the same point, and the box has no edge there.
+
     Args:
         low: lower corner, n finite numbers.
         high: upper corner, n finite numbers, each above that of `low`.
+        periodic: numbers of the periodic axes, counted from 0.
 
     Raises:
-        ArgumentError: the corners have different lengths, are empty, not finite or not ordered.
+        ArgumentError: the corners have different lengths, are empty, not finite or not ordered, or `periodic` names an
+            axis that does not exist, or names one twice.
     """
 
-    def __init__(self, low: Sequence[float], high: Sequence[float]):
+    def __init__(self, low: Sequence[float], high: Sequence[float], periodic: Sequence[int] = ()):
         self.low = tuple(float(value) for value in low)
         self.high = tuple(float(value) for value in high)
         if len(self.low) != len(self.high) or not self.low:
@@ -37,6 +42,7 @@ class Box:
         for axis, (a, b) in enumerate(zip(self.low, self.high, strict=True)):
             if not (math.isfinite(a) and math.isfinite(b) and a < b):
                 raise ArgumentError(f"Box: axis {axis} needs finite low < high, got low={a}, high={b}")
+        self.periodic = _axes(periodic, len(self.low))
         self._cache: dict[tuple[torch.dtype, torch.device], tuple[Tensor, Tensor]] = {}
 
     @property
@@ -62,9 +68,24 @@ class Box:
         center, half_width = self.center_and_half_width(z)
         return center + half_width * z
 
+    def wrap(self, x: Tensor) -> Tensor:
+        """Bring the periodic coordinates of points (*, n) into [low, high); the others stay as they are.
+
+        A coordinate that already lies there keeps every digit. The derivative in x is the identity.
+        """
+        if not self.periodic:
+            return x
+        columns = list(x.unbind(-1))
+        for axis in self.periodic:
+            columns[axis] = _wrapped(columns[axis], self.low[axis], self.high[axis])
+        # Each coordinate is contiguous in memory, because problems unbind states into coordinates.
+        return torch.stack(columns).movedim(0, -1)
+
     def contains(self, x: Tensor) -> Tensor:
-        """Whether points (*, n) lie in the closed box, (*) bool."""
-        return (self.normalize(x).abs() <= 1).all(-1)
+        """Whether points (*, n) lie in the closed box, (*) bool; every coordinate of a periodic axis does."""
+        inside = self.normalize(x).abs() <= 1
+        inside[..., list(self.periodic)] = True
+        return inside.all(-1)
 
     def sample(
         self,
@@ -75,24 +96,50 @@ class Box:
     ) -> Tensor:
         """Draw points (count, n) uniformly from the box."""
         unit = torch.rand(count, self.dim, generator=rng, dtype=dtype, device=device)
-        return self.denormalize(2 * unit - 1)
+        # Rounding may put a coordinate on the upper end of a period, which is its lower end.
+        return self.wrap(self.denormalize(2 * unit - 1))
 
     def expand(self, factor: float) -> Box:
-        """A box with the same center and `factor` times the widths."""
+        """A box with the same center and `factor` times the widths; a periodic axis keeps its period."""
         middle = [(a + b) / 2 for a, b in zip(self.low, self.high, strict=True)]
         half = [factor * (b - a) / 2 for a, b in zip(self.low, self.high, strict=True)]
-        return Box(
-            [m - h for m, h in zip(middle, half, strict=True)], [m + h for m, h in zip(middle, half, strict=True)]
-        )
+        low = [m - h for m, h in zip(middle, half, strict=True)]
+        high = [m + h for m, h in zip(middle, half, strict=True)]
+        for axis in self.periodic:
+            low[axis], high[axis] = self.low[axis], self.high[axis]
+        return Box(low, high, self.periodic)
+
+    def _key(self) -> tuple[tuple[float, ...], tuple[float, ...], tuple[int, ...]]:
+        return self.low, self.high, self.periodic
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Box) and (self.low, self.high) == (other.low, other.high)
+        return isinstance(other, Box) and self._key() == other._key()
 
     def __hash__(self) -> int:
-        return hash((self.low, self.high))
+        return hash(self._key())
 
     def __repr__(self) -> str:
-        return f"Box({list(self.low)}, {list(self.high)})"
+        periodic = f", periodic={list(self.periodic)}" if self.periodic else ""
+        return f"Box({list(self.low)}, {list(self.high)}{periodic})"
+
+
+def _axes(periodic: Sequence[int], dim: int) -> tuple[int, ...]:
+    """The numbers of the periodic axes in ascending order, after a check that a box of `dim` axes has them."""
+    known = isinstance(periodic, Sequence) and all(type(axis) is int and 0 <= axis < dim for axis in periodic)
+    if not known or len(set(periodic)) < len(periodic):
+        raise ArgumentError(
+            f"Box: periodic needs a list of different axis numbers from 0 to {dim - 1}, got {periodic!r}"
+        )
+    return tuple(sorted(periodic))
+
+
+def _wrapped(x: Tensor, low: float, high: float) -> Tensor:
+    """The coordinates x (*), each moved by a multiple of high - low into [low, high)."""
+    period = high - low
+    moved = x - period * torch.floor((x - low) / period)
+    # Rounding may leave a coordinate next to an end of the period, and both ends are the same point.
+    moved = torch.where((moved < low) | (moved >= high), torch.full_like(x, low), moved)
+    return torch.where((x >= low) & (x < high), x, moved)
 
 
 @dataclass(frozen=True)
@@ -101,7 +148,7 @@ class Plane:
 
     Attributes:
         axes: names of the two coordinates, with units.
-        box: range of the two coordinates.
+        box: range of the two coordinates; figures break paths at the ends of its periodic axes.
         embed: maps points of the plane (*, 2) to states (*, n).
         project: maps states (*, n) to the coordinates of the plane (*, 2).
     """

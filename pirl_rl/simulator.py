@@ -10,17 +10,20 @@ How an exit within a sub-step is detected is the rule `crossing`:
   Processes and their Applications 87, 2000). A face of a target with corners counts only if all other constraints of
   the target hold at both ends.
 
-A path that both reaches A and enters B within one sub-step counts as a failure.
+A path that both reaches A and enters B within one sub-step counts as a failure. Periodic coordinates are brought back
+into their period at the end of each sub-step, before levels are taken there.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
+from pirl_rl.clock import Clock
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
 
@@ -72,6 +75,11 @@ class Simulator:
         if self.crossing not in ("bridge", "endpoint"):
             raise ArgumentError(f"crossing: expected 'bridge' or 'endpoint', got {self.crossing!r}")
 
+    @cached_property
+    def clock(self) -> Clock:
+        """Counts the control steps of the problem's horizon."""
+        return Clock(self.dt, self.problem.horizon)
+
     @torch.no_grad()
     def step(self, x: Tensor, u: Tensor, rng: torch.Generator | None = None, dt: Tensor | None = None) -> Step:
         """Advance paths that are outside A and B by one control step.
@@ -99,10 +107,17 @@ class Simulator:
             reached = reached | (active & now_reached & ~now_failed)
         return Step(x, reached, failed)
 
-    def flow(self, x: Tensor, u: Tensor) -> Tensor:
-        """States (N, n) after a control step without noise and exits; differentiable in x (N, n) and u (N, m)."""
+    def flow(self, x: Tensor, u: Tensor, dt: Tensor | None = None) -> Tensor:
+        """States (N, n) after a control step without noise and exits; differentiable in x (N, n) and u (N, m).
+
+        Args:
+            x: states (N, n).
+            u: physical controls (N, m).
+            dt: the length of the step for each state (N,), in s; default `self.dt` for all.
+        """
+        h = self.dt / self.substeps if dt is None else (dt / self.substeps).to(x)[..., None]
         for _ in range(self.substeps):
-            x = x + self.problem.drift(x, u) * (self.dt / self.substeps)
+            x = self.problem.states.wrap(x + self.problem.drift(x, u) * h)
         return x
 
     def _euler_maruyama(self, x: Tensor, u: Tensor, h: Tensor, rng) -> tuple[Tensor, Tensor]:
@@ -114,7 +129,7 @@ class Simulator:
             moved = (sigma[(0,) * (sigma.ndim - 2)] @ noise).mT
         else:
             moved = (sigma * noise.movedim(0, -1).unsqueeze(-2)).sum(-1)
-        return x + self.problem.drift(x, u) * h[..., None] + moved, sigma
+        return self.problem.states.wrap(x + self.problem.drift(x, u) * h[..., None] + moved), sigma
 
     def _exits(self, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor, rng) -> tuple[Tensor, Tensor]:
         problem = self.problem

@@ -17,7 +17,8 @@ from pirl_rl.problem import ReachAvoidProblem
 class Solution:
     """The learned value and policy, where V is the mean of the critics at u = pi(tau, x).
 
-    In every method tau is (N,), in s, and x is (N, n), in SI units. Results have the dtype of the networks.
+    In every method tau is (N,), in s, and x is (N, n), in SI units; periodic coordinates may lie outside their period.
+    Results have the dtype of the networks.
 
     Args:
         problem: the physics.
@@ -52,6 +53,7 @@ class Solution:
     @torch.no_grad()
     def value(self, tau: Tensor, x: Tensor) -> Tensor:
         """V (N,): 1 in A, 0 in B and in unreachable states, and elsewhere `raw_value` clipped to [0, 1]."""
+        x = self.problem.states.wrap(x)
         lost = self.problem.failed(x) | self.problem.unreachable(x)
         return self.raw_value(tau, x).clamp(0, 1).masked_fill(self.problem.reached(x), 1.0).masked_fill(lost, 0.0)
 
@@ -77,8 +79,17 @@ class Solution:
         value = self.critic.at(action)(tau, x).mean(0)
         return torch.autograd.grad(value.sum(), x)[0]
 
-    def _own(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        return tuple(tensor.to(self.dtype) for tensor in tensors)
+    @torch.no_grad()
+    def hessian(self, tau: Tensor, x: Tensor) -> Tensor:
+        """The second derivatives of `raw_value` in x (N, n, n); the action of the critics is frozen."""
+        tau, x = self._own(tau, x)
+        value = self.critic.at(self._action(tau, x))
+        slope = torch.func.grad(lambda y: value(tau, y).mean(0).sum())
+        columns = [torch.func.jvp(slope, (x,), (axis.expand_as(x),))[1] for axis in torch.eye(x.shape[-1]).to(x)]
+        return torch.stack(columns, -1)
+
+    def _own(self, tau: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        return tau.to(self.dtype), self.problem.states.wrap(x.to(self.dtype))
 
     def _action(self, tau: Tensor, x: Tensor) -> Tensor:
         return self.actor(tau.unsqueeze(-1), x)

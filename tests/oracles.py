@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 
 import pirl_rl.problems
+from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sets import Box
+from pirl_rl.solution import Solution
 
 
 class FullNoise(ReachAvoidProblem):
@@ -39,6 +42,43 @@ class FullNoise(ReachAvoidProblem):
         return x[..., 0] + 0.8
 
 
+class Winding(FullNoise):
+    """`FullNoise` in three dimensions, whose second coordinate is an angle."""
+
+    def __init__(self):
+        super().__init__(3, 2, 2)
+        self.states = Box([-1.0, -1.1, -1.2], [2.0, 2 * math.pi - 1.1, 2.2], periodic=[1])
+
+
+class Circle(ReachAvoidProblem):
+    """dX = 0.8 dW on the circle [-1, 3): reach the arc |x| <= 0.5 within 2 s; the control does nothing.
+
+    Its level holds on [-1, 3) alone. The way from x = 2.5 over the seam is half as long as the other.
+    """
+
+    horizon = 2.0
+    states, controls = Box([-1.0], [3.0], periodic=[0]), Box([-1.0], [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return 0 * u
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.full_like(x, 0.8).unsqueeze(-1)
+
+    def target_level(self, x: Tensor) -> Tensor:
+        outside = (x < -1) | (x >= 3)
+        level = torch.minimum(x.abs(), 4 - x) - 0.5
+        return torch.where(outside, torch.nan, level).squeeze(-1)
+
+    def exact_value(self, tau: Tensor, x: Tensor) -> Tensor:
+        """The exit from an interval of length 3, by its eigenfunctions (Feller, volume 2, X.5)."""
+        y = (x.squeeze(-1) % 4 - 0.5).clamp(0, 3)
+        odd = 2 * torch.arange(200).to(x) + 1
+        decay = torch.exp(-0.5 * (0.8 * math.pi * odd / 3) ** 2 * tau[..., None])
+        stays = (4 / (math.pi * odd) * torch.sin(math.pi * odd * y[..., None] / 3) * decay).sum(-1)
+        return torch.where(tau > 0, 1 - stays, (y * (3 - y) <= 0).to(x))
+
+
 class Corner(ReachAvoidProblem):
     """Planar Brownian motion with drift; the target is a square, an intersection of four half-planes."""
 
@@ -57,7 +97,7 @@ class Corner(ReachAvoidProblem):
 
 
 SHIPPED = [getattr(pirl_rl.problems, name)() for name in pirl_rl.problems.__all__]
-PROBLEMS = [*SHIPPED, FullNoise(1, 1, 2), FullNoise(8, 2, 3)]
+PROBLEMS = [*SHIPPED, FullNoise(1, 1, 2), FullNoise(8, 2, 3), Winding()]
 
 
 def name(problem: ReachAvoidProblem) -> str:
@@ -107,3 +147,12 @@ def make_batch(problem: ReachAvoidProblem, count: int = 24) -> TensorDict:
     boundary = {"tau": edge[0].unsqueeze(-1), "state": edge[1], "value": torch.rand(count, generator=rng)}
     parts = {"replay": replay, "collocation": collocation, "boundary": boundary}
     return TensorDict({key: TensorDict(part, batch_size=[count]) for key, part in parts.items()})
+
+
+def random_solution(problem: ReachAvoidProblem, dtype: torch.dtype = torch.float64) -> Solution:
+    """Weights far from zero, so that every derivative counts."""
+    torch.manual_seed(0)
+    actor, critic = Actor(problem, (16,), "Tanh").to(dtype), Critic(problem, (16, 16), output="Sigmoid").to(dtype)
+    for parameter in critic.parameters():
+        nn.init.normal_(parameter, std=0.7)
+    return Solution(problem, actor, stack([critic]))

@@ -86,7 +86,7 @@ def test_is_init_marks_first_states_alone():
     assert ends > 100
 
 
-@pytest.mark.parametrize(("dt", "steps"), [(0.1, 20), (0.2, 10), (0.3, 7), (0.02, 100)])
+@pytest.mark.parametrize(("dt", "steps"), [(0.1, 20), (0.2, 10), (0.02, 100)])
 def test_an_episode_over_the_horizon_has_whole_steps(dt, steps):
     """In float32, far from the target: rounding neither adds nor drops one."""
     env = Reach1DEnv(dt=dt, num_envs=4, seed=0, initial_states=UniformStates([-60.0], [-50.0], tau="fixed"))

@@ -73,4 +73,4 @@ class ExactError:
             return tau, box.sample(count, rng, dtype=torch.float64)
         tau = torch.linspace(0, problem.horizon, self.tau_points, dtype=torch.float64)
         x = torch.linspace(box.low[0], box.high[0], self.x_points, dtype=torch.float64)
-        return tau.repeat_interleave(self.x_points), x.repeat(self.tau_points).unsqueeze(-1)
+        return tau.repeat_interleave(self.x_points), box.wrap(x.repeat(self.tau_points).unsqueeze(-1))

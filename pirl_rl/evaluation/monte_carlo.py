@@ -24,9 +24,6 @@ Array = TypeVar("Array", float, np.ndarray, Tensor)
 CHUNK = 32_768
 """Number of paths that are simulated at once. It bounds the memory, and a step fits into the cache of a core."""
 
-STEP_TOLERANCE = 1e-4
-"""The fraction of a step by which tau may exceed whole steps without a further step, because float32 rounds tau."""
-
 
 class Estimate(NamedTuple):
     """Means (N,) of `rollouts` payoffs and the ends (N,) of their confidence intervals, as tensors or arrays like the
@@ -112,7 +109,7 @@ def monte_carlo(
     simulator, times = Simulator(problem, dt, substeps, crossing), times.expand(len(points))
     rng = torch.Generator(points.device).manual_seed(seed)
     mean = mean_payoff(simulator, policy, times, points, rollouts, rng)
-    known = _known(problem, times, points)[0]
+    known = _known(problem, times, problem.states.wrap(points))[0]
     low, high = (torch.where(known, mean, end) for end in wilson_interval(mean * rollouts, rollouts, confidence))
     if isinstance(x, Tensor):
         return Estimate(*(entry.to(points.dtype) for entry in (mean, low, high)), rollouts=rollouts)
@@ -124,8 +121,9 @@ def mean_payoff(
     simulator: Simulator, policy: Policy, tau: Tensor, x: Tensor, rollouts: int, rng: torch.Generator
 ) -> Tensor:
     """Mean payoff (N,), float64, of paths from tau (N,) and x (N, n); the arguments are those of `monte_carlo`."""
+    x = simulator.problem.states.wrap(x)
     known, value = _known(simulator.problem, tau, x)
-    steps = torch.ceil(tau.double() / simulator.dt - STEP_TOLERANCE).clamp(min=1).long()
+    steps = simulator.clock.split(tau)[0].clamp(min=1)
     total, unknown = torch.zeros_like(tau, dtype=torch.float64), (~known).nonzero().squeeze(-1)
     count = len(unknown) * rollouts
     for start in range(0, count, CHUNK):

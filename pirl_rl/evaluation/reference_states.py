@@ -18,6 +18,7 @@ from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.monte_carlo import Policy
 from pirl_rl.evaluation.trajectories import closed_loop
 from pirl_rl.files import replacing
+from pirl_rl.layers import Periodic
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.initial_states import InitialStates, moved
 from pirl_rl.sets import Box
@@ -62,7 +63,8 @@ class ReferenceStates:
             problem: defines which states are terminal.
             tau: visited times to go (M,) in s.
             x: visited states (M, n) in SI units.
-            box: box of (tau, x) with n + 1 axes; scaled to [-1, 1], it gives the network coordinates.
+            box: box of (tau, x) with n + 1 axes, periodic where that of the problem is; scaled to [-1, 1], and with
+                sine and cosine of a periodic coordinate, it gives the network coordinates.
             rng: draws the choice of visited states, the directions and the lengths.
             count: number of states before terminal ones are dropped.
             radius: largest displacement in network coordinates.
@@ -74,7 +76,7 @@ class ReferenceStates:
         if not 1 <= neighbours <= len(x):
             raise ArgumentError(f"neighbours: expected 1 to {len(x)}, the number of visited states, got {neighbours}")
         new_tau, new_x = displaced(problem, tau, x, box, rng, count, radius)
-        visited, new = box.normalize(_joined(tau, x)), box.normalize(_joined(new_tau, new_x))
+        visited, new = _coordinates(box, tau, x), _coordinates(box, new_tau, new_x)
         distance = torch.cat([_mean_nearest(part, visited, neighbours) for part in new.split(DISTANCE_ROWS)])
         rank = distance.argsort().argsort()
         return cls(new_tau, new_x, distance, rank * len(GROUPS) // len(rank))
@@ -103,7 +105,7 @@ def displaced(
         problem: defines which states are terminal.
         tau: times to go (M,) in s.
         x: states (M, n) in SI units.
-        box: box of (tau, x) with n + 1 axes.
+        box: box of (tau, x) with n + 1 axes, periodic where that of the problem is.
         rng: draws the choice of states, the directions and the lengths.
         count: number of states that are moved.
         radius: largest displacement in the coordinates in which the box is [-1, 1]^(n + 1).
@@ -119,8 +121,10 @@ def displaced(
     # Each state is chosen once before any is chosen again.
     order = [torch.randperm(len(x), generator=rng, device=x.device) for _ in range(-(-count // len(x)))]
     chosen = torch.cat(order)[:count]
-    z = moved(box.normalize(_joined(tau[chosen], x[chosen])), radius, rng).clamp(-1, 1)
-    tau, x = (point := box.denormalize(z))[:, 0], point[:, 1:]
+    z, circles = moved(box.normalize(_joined(tau[chosen], x[chosen])), radius, rng), list(box.periodic)
+    clipped = z.clamp(-1, 1)
+    clipped[:, circles] = z[:, circles]
+    tau, x = (point := box.wrap(box.denormalize(clipped)))[:, 0], point[:, 1:]
     kept = problem.interior(x) & (tau > 0)
     return tau[kept], x[kept]
 
@@ -129,11 +133,17 @@ def visited_by(
     simulator: Simulator, policy: Policy, starts: InitialStates, episodes: int, rng: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """tau (M,) in s and states (M, n) on the paths of a policy, from each start to the last state before the end."""
-    max_steps = round(simulator.problem.horizon / simulator.dt)
-    steps, x = starts.sample(simulator.problem, episodes, max_steps, rng, torch.get_default_dtype())
-    paths = closed_loop(simulator, policy, (steps * simulator.dt).to(x), x, rng)
+    clock = simulator.clock
+    steps, x = starts.sample(simulator.problem, episodes, clock.max_steps, rng, torch.get_default_dtype())
+    paths = closed_loop(simulator, policy, clock.time(steps).to(x), x, rng)
     index = torch.arange(len(paths.tau), device=x.device).unsqueeze(-1)
     return paths.tau[index < paths.steps], paths.state[index < paths.steps]
+
+
+def _coordinates(box: Box, tau: Tensor, x: Tensor) -> Tensor:
+    """The network coordinates (N, d) of tau (N,) and x (N, n)."""
+    z = box.normalize(_joined(tau, x))
+    return Periodic(box.dim, box.periodic).to(z)(z) if box.periodic else z
 
 
 def _joined(tau: Tensor, x: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor
 from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.evaluator import Metrics
 from pirl_rl.evaluation.inputs import like, noise_rng, points_rng
+from pirl_rl.evaluation.largest_residual import largest_residual
 from pirl_rl.evaluation.reference_states import ReferenceStates
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.boundary import BoundarySampler
@@ -27,7 +28,7 @@ class Residuals:
     - hjb_loss: (L^pi V)^2, Eq. (linear_pde), at Sobol points of (0, T] and the box of states outside A and B. The value
       of a wrong policy satisfies this equation too.
     - hjb_sup_loss: (max_u L^u V)^2, Eq. (hjb_pde), at the same points, which exposes a wrong policy. The maximum is
-      over a grid of controls and the policy's control.
+      over levels of each control and the policy's control, see `pirl_rl.evaluation.largest_residual`.
     - value_slope: the mean of |grad V| at the same points, in the coordinates in which the box of states is [-1, 1]^n.
       It is 0 for a value that has collapsed to a constant, which satisfies both equations.
     - boundary_loss: (V - l_eps)^2, Eq. (parabolic_boundary), half of the points at tau = 0, half on the faces of A
@@ -39,8 +40,7 @@ class Residuals:
         points: number of points of each sample, at least 2.
         states: a callable that returns reference states to use instead of the Sobol points, for problems in which most
             of the box is never visited.
-        controls_per_axis: number of grid points of each control, bounds included, at least 2; the maximum takes this
-            number to the power m of evaluations.
+        controls_per_axis: number of levels of each control, bounds included, at least 2.
         seed: seed of points and noise.
 
     Raises:
@@ -78,10 +78,10 @@ class Residuals:
     def __call__(self, solution: Solution, simulator: Simulator) -> Metrics:
         rng = points_rng(self.seed)
         tau, x = self._interior(solution, rng)
-        along, largest = self._hjb(solution, tau, x)
+        along = solution.residual(tau, x)
         losses = {
             "hjb_loss": along,
-            "hjb_sup_loss": largest,
+            "hjb_sup_loss": largest_residual(solution, tau, x, along, self.controls_per_axis),
             "boundary_loss": self._boundary(solution, rng),
             "td_loss": self._td(solution, simulator, rng),
         }
@@ -100,16 +100,6 @@ class Residuals:
             mask = collocation.mask(tau, x)
         return like(solution, tau.squeeze(-1)[mask], x[mask])  # type: ignore[return-value]
 
-    def _hjb(self, solution: Solution, tau: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-        along = largest = solution.residual(tau, x)
-        axis = torch.linspace(-1, 1, self.controls_per_axis).to(tau)
-        for action in torch.cartesian_prod(*[axis] * solution.problem.controls.dim).view(
-            -1, solution.problem.controls.dim
-        ):
-            u = solution.problem.controls.denormalize(action).expand(len(x), -1)
-            largest = torch.maximum(largest, solution.residual(tau, x, u))
-        return along, largest
-
     def _boundary(self, solution: Solution, rng: torch.Generator) -> Tensor:
         half = self.points // 2
         points = BoundarySampler(solution.problem, self.points - half, half, tau_power=1.0).sample(rng)
@@ -118,10 +108,11 @@ class Residuals:
 
     def _td(self, solution: Solution, simulator: Simulator, rng: torch.Generator) -> Tensor:
         problem = solution.problem
-        max_steps = round(problem.horizon / simulator.dt)
-        steps, x = UniformStates().sample(problem, self.points, max_steps, rng, solution.dtype)
-        tau, tau_next, x = like(solution, steps * simulator.dt, (steps - 1) * simulator.dt, x)
-        step = simulator.step(x, solution.policy(tau, x), noise_rng(solution, self.seed))
+        clock = simulator.clock
+        steps, x = UniformStates().sample(problem, self.points, clock.max_steps, rng, solution.dtype)
+        tau, tau_next, x = like(solution, clock.time(steps), clock.time(steps - 1), x)
+        h = clock.length(steps, clock.shortfall).to(x)
+        step = simulator.step(x, solution.policy(tau, x), noise_rng(solution, self.seed), dt=h)
         ended = step.reached | step.failed | (steps == 1).to(solution.device)
         target = torch.where(ended, exit_value(problem, step), solution.raw_value(tau_next, step.state))
         return solution.raw_value(tau, x) - target

@@ -41,6 +41,7 @@ class Section:
         grid = torch.stack(torch.meshgrid(first, second, indexing="xy"), -1).reshape(-1, 2)
         tau = torch.full((len(grid),), solution.problem.horizon)
         tau, x = like(solution, tau, plane.embed(grid.double()))
+        x = solution.problem.states.wrap(x)
         value = solution.value(tau, x).cpu().reshape(points, points)
         return cls(plane, (first, second), tau, x, value)
 

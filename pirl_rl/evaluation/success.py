@@ -55,9 +55,9 @@ class Success:
 
     def __call__(self, solution: Solution, simulator: Simulator) -> Metrics:
         problem, rng = solution.problem, points_rng(self.seed)
-        max_steps = round(problem.horizon / simulator.dt)
-        steps, x = self.initial_states.sample(problem, self.episodes, max_steps, rng, solution.dtype)
-        tau, x = (steps * simulator.dt).to(solution.device, solution.dtype), x.to(solution.device)
+        clock = simulator.clock
+        steps, x = self.initial_states.sample(problem, self.episodes, clock.max_steps, rng, solution.dtype)
+        tau, x = clock.time(steps).to(solution.device, solution.dtype), x.to(solution.device)
         reward = rate = self._mean(simulator, solution.policy, tau, x)
         if problem.payoff.epsilon > 0:
             hard = copy.copy(problem)

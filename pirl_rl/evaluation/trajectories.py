@@ -38,19 +38,22 @@ def closed_loop(simulator: Simulator, policy: Policy, tau: Tensor, x: Tensor, rn
     Args:
         simulator: plays the steps.
         policy: maps tau (N,) and x (N, n) to the control (N, m) in SI units.
-        tau: times to go (N,) in s, rounded to whole control steps.
-        x: initial states (N, n) in SI units.
+        tau: times to go (N,) in s; the last control step is shorter where dt does not divide tau.
+        x: initial states (N, n) in SI units; the path starts with their periodic coordinates in [low, high).
         rng: draws the noise.
     """
-    problem, left = simulator.problem, torch.round(tau.double() / simulator.dt).long()
+    problem, clock = simulator.problem, simulator.clock
+    left, shortfall = clock.split(tau)
+    x = problem.states.wrap(x)
     reached, failed, steps = problem.reached(x), problem.failed(x), torch.zeros_like(left)
     times, states = [tau], [x]
     for _ in range(int(left.max())):
-        step = simulator.step(x, policy((left * simulator.dt).to(x), x).to(x.dtype), rng)
+        u = policy(clock.time(left, shortfall).to(x), x).to(x.dtype)
+        step = simulator.step(x, u, rng, dt=clock.length(left, shortfall).to(x))
         active = ~(reached | failed) & (left > 0)
         x = torch.where(active.unsqueeze(-1), step.state, x)
         reached, failed = reached | (active & step.reached), failed | (active & step.failed)
         steps, left = steps + active, (left - 1).clamp(min=0)
-        times.append((left * simulator.dt).to(x))
+        times.append(clock.time(left, shortfall).to(x))
         states.append(x)
     return Trajectories(torch.stack(times), torch.stack(states), steps, reached, failed)

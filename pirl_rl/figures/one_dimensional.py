@@ -40,7 +40,7 @@ def evaluate_on_grid(solution: Solution, taus: int = 101, states: int = 201) -> 
     problem = solution.problem
     tau = torch.linspace(0, problem.horizon, taus, dtype=torch.float64)
     x = torch.linspace(problem.states.low[0], problem.states.high[0], states, dtype=torch.float64)
-    points = tau.repeat(states), x.repeat_interleave(taus).unsqueeze(-1)
+    points = tau.repeat(states), problem.states.wrap(x.repeat_interleave(taus).unsqueeze(-1))
     exact = problem.exact_value(*points)
     inputs = [entry.to(solution.device, solution.dtype) for entry in points]
     shape = (states, taus)

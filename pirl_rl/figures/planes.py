@@ -1,12 +1,14 @@
-"""Heat maps on a plane of the state space."""
+"""Heat maps and paths on a plane of the state space."""
 
 from __future__ import annotations
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from torch import Tensor
 
 from pirl_rl.evaluation.slices import Section
+from pirl_rl.sets import Box
 
 CONTOURS = (0.1, 0.5, 0.9)
 
@@ -20,3 +22,14 @@ def draw_plane(axes: Axes, section: Section, values: Tensor) -> QuadMesh:
     axes.set(xlabel=section.plane.axes[0], ylabel=section.plane.axes[1])
     axes.set(xlim=(first[0], first[-1]), ylim=(second[0], second[-1]))
     return mesh
+
+
+def broken_at_seams(path: np.ndarray, box: Box) -> np.ndarray:
+    """A path (k, 2) in the coordinates of a plane, with a row of NaN, which is not drawn, at every jump over a seam.
+
+    A step of more than half a period of a periodic axis of the plane's box counts as a jump.
+    """
+    width = np.array(box.high) - np.array(box.low)
+    circles = list(box.periodic)
+    jumps = (np.abs(np.diff(path, axis=0)) > width / 2)[:, circles].any(-1)
+    return np.insert(path, np.flatnonzero(jumps) + 1, np.nan, axis=0)

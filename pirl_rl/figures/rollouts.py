@@ -9,7 +9,7 @@ from matplotlib.patches import Patch
 
 from pirl_rl.evaluation.rollouts import RolloutsEvidence
 from pirl_rl.figures.evidence import draw
-from pirl_rl.figures.planes import draw_plane
+from pirl_rl.figures.planes import broken_at_seams, draw_plane
 
 BEYOND = "0.5"
 """The colour of the part of a panel beyond the plane's box, where V is not drawn."""
@@ -34,7 +34,7 @@ def draw_rollouts(evidence: RolloutsEvidence) -> dict[str, Figure]:
         projected = section.plane.project(paths.state).numpy()
         for i, end in enumerate(ends):
             path = projected[: paths.steps[i] + 1, i]
-            axes.plot(*path.T, color=STARTS[i // each], lw=0.8)
+            axes.plot(*broken_at_seams(path, section.plane.box).T, color=STARTS[i // each], lw=0.8)
             axes.plot(*path[0], "D", color=STARTS[i // each], mec="black", mew=0.6, ms=6, zorder=3)
             axes.plot(*path[-1], ENDS[end][0], color=ENDS[end][1], mec="black", mew=0.6, ms=6, zorder=3)
         axes.autoscale()

@@ -88,7 +88,7 @@ class Run:
         """Simulate one path from each state under the learned policy.
 
         Args:
-            tau: time to go in s, rounded to whole control steps.
+            tau: time to go in s; the last control step is shorter where dt does not divide it.
             x: initial states (N, n) in SI units.
             dt: control step in s; the default of this and of the next two is that of the training.
             substeps: number of integration steps in a control step.

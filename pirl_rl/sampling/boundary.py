@@ -93,6 +93,7 @@ def _face_pool(problem: ReachAvoidProblem, rng: torch.Generator) -> tuple[Tensor
     given = problem.faces(FACE_POOL, rng)
     if given is not None:
         points, values = given
+        points = problem.states.wrap(points)
         return points.to(torch.get_default_dtype()), values.to(torch.get_default_dtype())
     wide = problem.states.expand(2.0)
     candidates = wide.sample(4 * FACE_POOL, rng, dtype=torch.float64)

@@ -62,7 +62,7 @@ class Collocation:
         unit = self._unit(rng)
         # 1 - U lies in (0, 1]: tau = 0 belongs to the boundary.
         tau = self.problem.horizon * (1 - unit[:, :1]) ** self.tau_power
-        state = self.box.denormalize(2 * unit[:, 1:] - 1)
+        state = self.box.wrap(self.box.denormalize(2 * unit[:, 1:] - 1))
         return TensorDict({"tau": tau, "state": state, "mask": self.mask(tau, state)}, batch_size=[self.size])
 
     def mask(self, tau: Tensor, state: Tensor) -> Tensor:
@@ -124,7 +124,8 @@ class ReplayCollocation(Collocation):
         # a masked point.
         tau = torch.abs(replay["tau"][index] + step[:, :1] * horizon / 2)
         tau = horizon - torch.abs(horizon - tau)
-        state = self.problem.states.denormalize(self.problem.states.normalize(replay["state"][index]) + step[:, 1:])
+        states = self.problem.states
+        state = states.wrap(states.denormalize(states.normalize(replay["state"][index]) + step[:, 1:]))
         taken = torch.rand(self.size, 1, generator=rng, device=device) < share
         tau, state = torch.where(taken, tau, rest["tau"]), torch.where(taken, state, rest["state"])
         return TensorDict({"tau": tau, "state": state, "mask": self.mask(tau, state)}, batch_size=[self.size])

@@ -1,4 +1,4 @@
-"""Initial states of episodes: x outside A and B, and a whole number of control steps to go, so that tau = steps dt."""
+"""Initial states of episodes: x outside A and B, and a number of control steps to go, see `pirl_rl.clock`."""
 
 from __future__ import annotations
 
@@ -123,7 +123,8 @@ class VisitedStates:
             return steps, x
         device = rng.device
         start = visited[torch.randint(len(visited), (count,), generator=rng, device=device)]
-        near = problem.states.denormalize(moved(problem.states.normalize(start), self.radius, rng))
+        states = problem.states
+        near = states.wrap(states.denormalize(moved(states.normalize(start), self.radius, rng)))
         taken = torch.rand(count, generator=rng, device=device) < self.share
         taken = taken & problem.interior(near) & ~problem.unreachable(near)
         return steps, torch.where(taken.unsqueeze(-1), near, x)
@@ -164,7 +165,7 @@ def sample_interior(
     Raises:
         ProblemError: no such state is found.
     """
-    return redrawn(problem, count, lambda missing: box.sample(missing, rng, dtype, rng.device))
+    return redrawn(problem, count, lambda missing: problem.states.wrap(box.sample(missing, rng, dtype, rng.device)))
 
 
 def redrawn(problem: ReachAvoidProblem, count: int, draw: Callable[[int], Tensor]) -> Tensor:

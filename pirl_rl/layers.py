@@ -1,0 +1,103 @@
+"""The layers of actor and critics, in physical units at the input.
+
+Parameters and buffers may have leading axes, over which `forward` broadcasts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+
+class Dense(nn.Linear):
+    """x W^T + b (*, N, out) of x (*, N, in); weight (*, out, in) and bias (*, out) may be stacked."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        return torch.matmul(input, self.weight.mT) + self.bias.unsqueeze(-2)
+
+
+class Scaling(nn.Module):
+    """The affine map of the box [low, high] to [-1, 1]^d, for inputs (*, N, d).
+
+    As a layer it needs no scaled copy of the physics: derivatives in physical units follow by the chain rule.
+
+    Args:
+        low: lower corner, d numbers.
+        high: upper corner, d numbers.
+    """
+
+    scale: Tensor
+    shift: Tensor
+
+    def __init__(self, low: Sequence[float], high: Sequence[float]):
+        super().__init__()
+        low_, high_ = torch.as_tensor(low, dtype=torch.float64), torch.as_tensor(high, dtype=torch.float64)
+        scale = 2 / (high_ - low_)
+        self.register_buffer("scale", scale.to(torch.get_default_dtype()))
+        self.register_buffer("shift", (-(low_ + high_) / 2 * scale).to(torch.get_default_dtype()))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x * self.scale.unsqueeze(-2) + self.shift.unsqueeze(-2)
+
+
+class RootTime(nn.Module):
+    """Appends sqrt(tau + tau_0) to inputs (*, d) whose first entry is the time to go tau.
+
+    Where the boundary data jump at tau = 0, V varies over a width proportional to sqrt(tau). As a function of the root
+    of time that is a wedge, which a small network can represent up to tau = 0.
+
+    Args:
+        tau_0: in s, above 0; it bounds the slope 1/(2 sqrt(tau + tau_0)) at tau = 0.
+    """
+
+    def __init__(self, tau_0: float):
+        super().__init__()
+        self.tau_0 = tau_0
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.cat([x, torch.sqrt(x[..., :1] + self.tau_0)], -1)
+
+
+class Periodic(nn.Module):
+    """Replaces periodic coordinates by sine and cosine of their angle: (*, N, d) -> (*, N, d + k) for k of them.
+
+    The angle of a coordinate z, in which the period is [-1, 1], is pi (z + 1) = 2 pi (x - low)/(high - low). Its sine
+    takes the place of z, and its cosine, the sine of the angle plus pi/2, comes after all other coordinates.
+
+    Args:
+        width: the number d of coordinates.
+        columns: the k periodic ones among them, counted from 0.
+    """
+
+    frequency: Tensor
+    phase: Tensor
+
+    def __init__(self, width: int, columns: Sequence[int]):
+        super().__init__()
+        self.columns = tuple(columns)
+        frequency, phase = torch.zeros(2, width + len(columns))
+        frequency[[*columns, *range(width, width + len(columns))]] = math.pi
+        phase[width:] = math.pi / 2
+        self.register_buffer("frequency", frequency)
+        self.register_buffer("phase", phase)
+
+    def widened(self, z: Tensor) -> Tensor:
+        """The coordinates z (*, d) and once more the periodic ones, (*, d + k)."""
+        return torch.cat([z, *(z[..., column : column + 1] for column in self.columns)], -1)
+
+    def waves(self, wide: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The outputs of widened coordinates (*, N, d + k), and their first and second derivatives, likewise."""
+        frequency = self.frequency.unsqueeze(-2)
+        angle, periodic = frequency * (wide + 1) + self.phase.unsqueeze(-2), frequency > 0
+        sine, slope = torch.sin(angle), frequency * torch.cos(angle)
+        return (
+            torch.where(periodic, sine, wide),
+            torch.where(periodic, slope, torch.ones_like(slope)),
+            -frequency.square() * sine,
+        )
+
+    def forward(self, z: Tensor) -> Tensor:
+        return self.waves(self.widened(z))[0]
