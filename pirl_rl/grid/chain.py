@@ -1,0 +1,173 @@
+"""The Markov chain of each candidate control: its jump rates between nodes and into A and B.
+
+The covariance per unit of time, in units of the mesh, is a sum of lambda_k v_k v_k^T over whole offsets v_k, see
+`pirl_rl.grid.stencil`. Let p and q in (0, 1] be the fractions of v_k and of -v_k that a straight path covers before it
+enters A or B; they are 1 where it does not. The rates forward and backward are
+
+    lambda_k (1 + c_k q) / (p (p + q)),   lambda_k (1 - c_k p) / (q (p + q)),
+
+second differences with unequal arms (G. Shortley and R. Weller, Journal of Applied Physics 9, 1938), so that faces of A
+and B lie where the level functions have them, not at nodes. They have the drift c_k lambda_k v_k. With c_k = v_k . D^-1 F
+these drifts add up to the drift F. Since rates must not be negative, c_k is limited to [-1/q, 1/p]. What then is left
+of F moves along the axes, as an upwind difference: the rate |R_i| / p for the rest R_i > 0, with p of the arm along R_i.
+Thus the scheme has central differences, of second order, where the noise is strong enough, and is of first order else.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy import sparse
+
+from pirl_rl.grid.mesh import Mesh, absorbed
+from pirl_rl.grid.stencil import bounded, decompose
+from pirl_rl.problem import ReachAvoidProblem, has_controlled_noise
+
+LOOKS = 4
+"""Number of points of an arm at which A and B are looked for; a set that passes between them is not seen."""
+
+BISECTIONS = 12
+"""The face is located to a fraction of 1 / (4 * 2^12) of an arm."""
+
+SHORTEST = 1e-3
+"""The smallest fraction of an arm; it bounds the rates, and moves a face by at most this share of a node distance."""
+
+
+class Arm(NamedTuple):
+    """Straight paths from M nodes along an offset.
+
+    Attributes:
+        fraction: how much of the offset is covered before A or B (M,), in (0, 1].
+        node: the number of the node at its end (M,), among all nodes.
+        cut: whether it ends in A or B (M,) bool.
+        value: V where it is cut, else 0 (M,).
+    """
+
+    fraction: np.ndarray
+    node: np.ndarray
+    cut: np.ndarray
+    value: np.ndarray
+
+
+class Noise(NamedTuple):
+    """The covariance of the noise per unit of time, in units of the mesh.
+
+    Attributes:
+        inverse: D^-1 (M, n, n), or (1, n, n) if it is the same at all nodes.
+        directions: weight (M,) or (1,), offset (M, n) or (1, n), and the arms forward and backward, for each v_k.
+    """
+
+    inverse: np.ndarray
+    directions: list[tuple[np.ndarray, np.ndarray, Arm, Arm]]
+
+
+class Chain:
+    """The chains of all candidates on the nodes outside A and B.
+
+    Args:
+        problem: the physics.
+        mesh: the nodes.
+        free: numbers (M,) of the nodes outside A and B.
+        controls: candidate controls (K, M, m), in SI units.
+
+    Attributes:
+        axes: forward and backward arms along each axis.
+    """
+
+    def __init__(self, problem: ReachAvoidProblem, mesh: Mesh, free: np.ndarray, controls: np.ndarray):
+        self._problem, self._mesh = problem, mesh
+        self._at = mesh.indices()[free]
+        self._unknown = np.full(mesh.size, -1)
+        self._unknown[free] = np.arange(len(free))
+        self.axes = [(self._arm(offset), self._arm(-offset)) for offset in np.eye(len(mesh.shape), dtype=int)]
+        x = torch.from_numpy(mesh.states(self._at))
+        noise, blocks, gains = None, [], []
+        for u in controls:
+            control = torch.from_numpy(np.ascontiguousarray(u))
+            drift = problem.drift(x, control).numpy() / mesh.spacing
+            if noise is None or has_controlled_noise(problem):
+                noise = self._noise(problem.diffusion(x, control).numpy())
+            rates, gain = self._assembled(drift, noise)
+            blocks.append(rates)
+            gains.append(gain)
+        self._rates: sparse.csr_array = sparse.vstack(blocks, format="csr")
+        self._gains = np.concatenate(gains)
+
+    def generator(self, value: np.ndarray) -> np.ndarray:
+        """The generator of every candidate (K, M), in 1/s, of V (M,) at the nodes."""
+        return (self._rates @ value + self._gains).reshape(-1, len(value))
+
+    def of(self, policy: np.ndarray) -> tuple[sparse.csr_array, np.ndarray]:
+        """The chain of a policy, given as the numbers (M,) of candidates.
+
+        Returns:
+            Rates (M, M) and gain (M,), both in 1/s: the generator of V is rates @ V + gain.
+        """
+        rows = policy * len(policy) + np.arange(len(policy))
+        return self._rates[rows], self._gains[rows]
+
+    def _arm(self, offsets: np.ndarray) -> Arm:
+        """The arms from all nodes along offsets (M, n), or one offset (n,)."""
+        problem, mesh = self._problem, self._mesh
+        offsets = np.broadcast_to(offsets, self._at.shape)
+        cut, fraction = np.zeros(len(offsets), bool), np.ones(len(offsets))
+        for look in range(1, LOOKS + 1):
+            now = ~cut & absorbed(problem, mesh.states(self._at + offsets * (look / LOOKS)))[0]
+            fraction[now], cut = look / LOOKS, cut | now
+        start, step, far = self._at[cut], offsets[cut], fraction[cut]
+        near = far - 1 / LOOKS
+        for _ in range(BISECTIONS):
+            middle = (near + far) / 2
+            inside = absorbed(problem, mesh.states(start + step * middle[:, None]))[0]
+            near, far = np.where(inside, near, middle), np.where(inside, middle, far)
+        value = np.zeros(len(offsets))
+        value[cut] = absorbed(problem, mesh.states(start + step * far[:, None]))[1]
+        fraction[cut] = np.maximum(far, SHORTEST)
+        return Arm(fraction, mesh.flat(self._at + offsets), cut, value)
+
+    def _noise(self, sigma: np.ndarray) -> Noise:
+        """The noise of sigma (M, n, w)."""
+        scaled = sigma / self._mesh.spacing[:, None]
+        covariance = scaled @ scaled.swapaxes(-2, -1)
+        constant = bool((covariance == covariance[:1]).all())
+        covariance = bounded(covariance[:1] if constant else covariance, 1 / max(self._mesh.shape))
+        weights, offsets = decompose(covariance)
+        # An axis without noise has no inverse; with this small addition its c_k are beyond every limit.
+        trace = np.trace(covariance, axis1=-2, axis2=-1)[:, None, None]
+        inverse = np.linalg.inv(covariance + (1e-9 * trace + 1e-30) * np.eye(covariance.shape[-1]))
+        directions = []
+        for weight, offset in zip(weights.T, offsets.swapaxes(0, 1), strict=True):
+            if weight.any():
+                directions.append((weight, offset, self._arm(offset), self._arm(-offset)))
+        return Noise(inverse, directions)
+
+    def _assembled(self, drift: np.ndarray, noise: Noise) -> tuple[sparse.csr_array, np.ndarray]:
+        """The rates (M, M) and the gain (M,) of one candidate with its drift (M, n), in units of the mesh per s."""
+        jumps, rest = [], drift.copy()
+        slope = np.einsum("pij,pj->pi", np.broadcast_to(noise.inverse, (len(drift), *noise.inverse.shape[1:])), drift)
+        for weight, offset, forward, backward in noise.directions:
+            p, q = forward.fraction, backward.fraction
+            share = (offset * slope).sum(-1).clip(-1 / q, 1 / p)
+            jumps.append((forward, weight * (1 + share * q) / (p * (p + q))))
+            jumps.append((backward, weight * (1 - share * p) / (q * (p + q))))
+            rest -= (share * weight)[:, None] * offset
+        for axis, (forward, backward) in enumerate(self.axes):
+            jumps.append((forward, rest[:, axis].clip(0) / forward.fraction))
+            jumps.append((backward, (-rest[:, axis]).clip(0) / backward.fraction))
+        size = len(drift)
+        gain, out = np.zeros(size), np.zeros(size)
+        rows, columns, rates = [], [], []
+        for arm, rate in jumps:
+            gain += rate * arm.value
+            out += rate
+            inner = ~arm.cut & (rate > 0)
+            rows.append(np.flatnonzero(inner))
+            columns.append(self._unknown[arm.node[inner]])
+            rates.append(rate[inner])
+        rows.append(np.arange(size))
+        columns.append(np.arange(size))
+        rates.append(-out)
+        entries = np.concatenate(rates), (np.concatenate(rows), np.concatenate(columns))
+        return sparse.coo_array(entries, shape=(size, size)).tocsr(), gain

@@ -1,0 +1,115 @@
+"""The mesh: equidistant nodes of a box around `problem.states`, and which of them lie in A or B.
+
+The box is wider than `states` on every axis that is not periodic, because paths leave `states` and return, and then cut
+down to the nodes outside A and B with one layer around them. Beyond the mesh the chain is put back on its edge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from pirl_rl.errors import ArgumentError
+from pirl_rl.problem import ReachAvoidProblem
+
+DEVIATIONS = 3.0
+"""Number of standard deviations by which the box is widened. A path that goes so far and comes back covers six."""
+
+WIDEST = {1: 1.0, 2: 1.0, 3: 0.5}
+"""The largest margin on a side, in widths of `states`, by the number of states: in three dimensions it costs most."""
+
+
+class Mesh:
+    """Equidistant nodes, ordered with the last axis fastest.
+
+    Args:
+        low: the first node (n,), in SI units.
+        spacing: distance of neighbours along each axis (n,), in SI units.
+        shape: number of nodes along each axis (n,).
+        periodic: axes along which the first node follows the last one.
+    """
+
+    def __init__(self, low: np.ndarray, spacing: np.ndarray, shape: Sequence[int], periodic: Sequence[int] = ()):
+        self.low, self.spacing = low, spacing
+        self.shape = tuple(int(count) for count in shape)
+        self.periodic = tuple(periodic)
+
+    @property
+    def size(self) -> int:
+        """The number of nodes N."""
+        return int(np.prod(self.shape))
+
+    def indices(self) -> np.ndarray:
+        """The indices (N, n) of all nodes along the axes."""
+        return np.indices(self.shape).reshape(len(self.shape), -1).T
+
+    def states(self, indices: np.ndarray) -> np.ndarray:
+        """The states (*, n) at indices (*, n), which need not be whole; periodic axes are wrapped."""
+        indices = indices.astype(float)
+        for axis in self.periodic:
+            indices[..., axis] %= self.shape[axis]
+        return self.low + self.spacing * indices
+
+    def flat(self, indices: np.ndarray) -> np.ndarray:
+        """The numbers (*) of the nodes at whole indices (*, n), wrapped or put on the edge."""
+        modes = ["wrap" if axis in self.periodic else "clip" for axis in range(len(self.shape))]
+        return np.ravel_multi_index(tuple(np.moveaxis(indices, -1, 0)), self.shape, mode=tuple(modes))
+
+    def corners(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Multilinear interpolation at states (P, n): numbers (2^n, P) of nodes and their weights (2^n, P)."""
+        position = (x - self.low) / self.spacing
+        for axis in set(range(len(self.shape))) - set(self.periodic):
+            position[:, axis] = position[:, axis].clip(0, self.shape[axis] - 1)
+        base = np.floor(position)
+        share = position - base
+        offsets = np.indices((2,) * len(self.shape)).reshape(len(self.shape), -1).T[:, None]
+        weights = np.where(offsets == 1, share, 1 - share).prod(-1)
+        return self.flat(base.astype(int) + offsets), weights
+
+
+def absorbed(problem: ReachAvoidProblem, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Whether states (P, n) are in A or B (P,) bool, and the value there (P,): 1 in A, 0 in B and elsewhere."""
+    points = torch.from_numpy(x)
+    reached, failed = problem.reached(points).numpy(), problem.failed(points).numpy()
+    return reached | failed, (reached & ~failed).astype(float)
+
+
+def default_margin(problem: ReachAvoidProblem, samples: int = 4096) -> np.ndarray:
+    """How far (n,) the box is widened on each side, in SI units, from drift and noise at sampled states and controls.
+
+    It is the way that the drift goes out and back within the horizon and `DEVIATIONS` standard deviations of the noise,
+    but at most `WIDEST`, and 0 on periodic axes.
+    """
+    rng = torch.Generator().manual_seed(0)
+    x = problem.states.sample(samples, rng, torch.float64)
+    u = problem.controls.sample(samples, rng, torch.float64)
+    speed = problem.drift(x, u).abs().amax(0).numpy()
+    noise = problem.diffusion(x, u).norm(dim=-1).amax(0).numpy()
+    margin = speed * problem.horizon / 2 + DEVIATIONS * noise * problem.horizon**0.5
+    width = np.array(problem.states.high) - problem.states.low
+    margin = np.minimum(margin, WIDEST[problem.states.dim] * width)
+    margin[list(problem.states.periodic)] = 0.0
+    return margin
+
+
+def make_mesh(problem: ReachAvoidProblem, points: Sequence[int], margin: np.ndarray) -> Mesh:
+    """The mesh with `points` nodes across `states` along each axis, widened by `margin` (n,) on each side, then cut.
+
+    Raises:
+        ArgumentError: every node lies in A or B.
+    """
+    low, width = np.array(problem.states.low), np.array(problem.states.high) - problem.states.low
+    periodic, count = tuple(problem.states.periodic), np.array(points)
+    spacing = width / np.where(np.isin(np.arange(len(low)), periodic), count, count - 1)
+    extra = np.ceil(margin / spacing - 1e-9).astype(int)
+    wide = Mesh(low - extra * spacing, spacing, count + 2 * extra, periodic)
+    free = ~absorbed(problem, wide.states(wide.indices()))[0].reshape(wide.shape)
+    if not free.any():
+        raise ArgumentError(f"points: expected nodes outside of target and avoid set, got none with points={points}")
+    first, last = np.zeros(len(low), int), np.array(wide.shape) - 1
+    for axis in set(range(len(low))) - set(periodic):
+        inside = np.flatnonzero(free.any(tuple(other for other in range(len(low)) if other != axis)))
+        first[axis], last[axis] = max(inside[0] - 1, 0), min(inside[-1] + 1, last[axis])
+    return Mesh(wide.low + first * spacing, spacing, last - first + 1, periodic)

@@ -1,0 +1,106 @@
+"""The value and the policy on a mesh, interpolated, with the estimate of the error."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pirl_rl.errors import ArgumentError
+from pirl_rl.grid.mesh import Mesh
+from pirl_rl.problem import ReachAvoidProblem
+
+ROUNDING = 1e-4
+"""The share of the horizon by which tau may exceed it, because tau may be rounded to float32."""
+
+
+class GridSolution:
+    """V and an optimal policy, multilinear in x and linear in sqrt(tau) between the nodes.
+
+    Beyond the mesh V and the policy are those of the nearest point of its edge. In every method tau is (P,), in s, and
+    x is (P, n), in SI units. Results have the dtype and the device of x.
+
+    Args:
+        problem: the physics.
+        mesh: the nodes.
+        values: V (steps + 1, N) at tau = horizon * (k / steps)^2. At nodes in A and B it is continued from outside, so
+            that the interpolated V takes the value of the set at its face.
+        policy: numbers (steps + 1, M) of the best candidates at the nodes outside A and B.
+        controls: candidate controls (K, M, m), in SI units.
+        nearest: for every node (N,) the place, among the M nodes, of the nearest node outside A and B.
+        coarse: the solution with half as many points and steps, or None, and then the error is not known.
+    """
+
+    def __init__(
+        self,
+        problem: ReachAvoidProblem,
+        mesh: Mesh,
+        values: np.ndarray,
+        policy: np.ndarray,
+        controls: np.ndarray,
+        nearest: np.ndarray,
+        coarse: GridSolution | None = None,
+    ):
+        self.problem, self.mesh, self.coarse = problem, mesh, coarse
+        self._values, self._policy, self._controls, self._nearest = values, policy, controls, nearest
+
+    def value(self, tau: Tensor, x: Tensor) -> Tensor:
+        """V (P,) in [0, 1]: 1 in A, 0 in B and in unreachable states.
+
+        Raises:
+            ArgumentError: a tau is outside [0, horizon].
+        """
+        result = np.zeros(len(x))
+        for time, node, weight in self._corners(tau, x):
+            result += weight * self._values[time, node]
+        lost = self.problem.failed(x) | self.problem.unreachable(x)
+        value = torch.from_numpy(result).to(x).clamp(0, 1)
+        return value.masked_fill(self.problem.reached(x), 1.0).masked_fill(lost, 0.0)
+
+    def policy(self, tau: Tensor, x: Tensor) -> Tensor:
+        """The control (P, m), in SI units.
+
+        Raises:
+            ArgumentError: a tau is outside [0, horizon].
+        """
+        result = np.zeros((len(x), self._controls.shape[-1]))
+        for time, node, weight in self._corners(tau, x):
+            place = self._nearest[node]
+            result += weight[:, None] * self._controls[self._policy[time, place], place]
+        return torch.from_numpy(result).to(x)
+
+    def error(self, tau: Tensor, x: Tensor) -> Tensor:
+        """An estimate (P,) of the error of `value`: its distance from V with half as many points and steps.
+
+        The scheme is of first order or better, so that halving the mesh leaves at least half of the error of the coarse
+        one; the distance then is at least the error of the fine one.
+
+        Raises:
+            ArgumentError: the solution was computed without an estimate, or a tau is outside [0, horizon].
+        """
+        if self.coarse is None:
+            raise ArgumentError("error: expected a solution with an estimate, got one of GridSolver(estimate=False)")
+        return (self.value(tau, x) - self.coarse.value(tau, x)).abs()
+
+    @property
+    def largest_error(self) -> float:
+        """The largest `error` at tau = horizon over the nodes within `problem.states`.
+
+        It is taken at the horizon, since V jumps at tau = 0 on the faces, where no mesh has a small error.
+        """
+        x = torch.from_numpy(self.mesh.states(self.mesh.indices()))
+        x = x[self.problem.states.contains(x)]
+        return float(self.error(torch.full((len(x),), self.problem.horizon, dtype=x.dtype), x).max())
+
+    def _corners(self, tau: Tensor, x: Tensor):
+        """Time level, node and weight, each (P,), of every point that interpolation at tau (P,) and x (P, n) uses."""
+        horizon, last = self.problem.horizon, len(self._values) - 1
+        if not bool(((tau >= 0) & (tau <= horizon * (1 + ROUNDING))).all()):
+            raise ArgumentError(f"tau: expected 0 <= tau <= horizon = {horizon}, got {tau.min()} to {tau.max()}")
+        level = last * np.sqrt((tau.double().cpu().numpy() / horizon).clip(0, 1))
+        before = np.floor(level).astype(int).clip(0, last - 1)
+        share = level - before
+        nodes, weights = self.mesh.corners(x.detach().double().cpu().numpy())
+        for node, weight in zip(nodes, weights, strict=True):
+            yield before, node, weight * (1 - share)
+            yield before + 1, node, weight * share

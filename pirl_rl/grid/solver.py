@@ -1,0 +1,163 @@
+"""The solver: implicit Euler steps in tau, each solved by policy iteration (R. Howard 1960).
+
+A step from V' to V solves V - dt max_u {rates(u) V + gain(u)} = V', and an error r of this equation is an error of at
+most |r| in V, because the scheme is monotone. The steps are equidistant in sqrt(tau), since V changes fastest where
+tau is small.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy import sparse
+from scipy.ndimage import distance_transform_edt
+from scipy.sparse.linalg import LinearOperator, bicgstab, spsolve
+
+from pirl_rl.errors import ArgumentError
+from pirl_rl.grid.candidates import candidates
+from pirl_rl.grid.chain import Chain
+from pirl_rl.grid.mesh import Mesh, absorbed, default_margin, make_mesh
+from pirl_rl.grid.solution import GridSolution
+from pirl_rl.problem import ReachAvoidProblem
+
+POINTS = {1: 401, 2: 121, 3: 51}
+"""Default numbers of nodes across `states` along each axis, by the number of states."""
+
+TOLERANCE = 1e-7
+"""The largest error of the equation of one step."""
+
+ITERATIONS = 50
+"""The largest number of policy iterations in a step; two or three are usual."""
+
+LEAST_FRACTION = 0.05
+"""V is continued into A and B along arms at least this long, as the slope along shorter ones is mostly rounding."""
+
+
+class GridSolver:
+    """Solves the HJB equation of a problem on a mesh.
+
+    Args:
+        problem: the physics, with at most three states.
+        points: number of nodes across `problem.states` along each axis, at least 5; one number serves all axes. A part of
+            A or B that is thinner than the distance of two nodes may be missed.
+        steps: number of steps in tau, at least 2; the default is the largest number of points.
+        margin: how far the mesh goes beyond `problem.states` on each side, in SI units, one number for each axis. The
+            default follows from drift, noise and horizon, see `pirl_rl.grid.mesh.default_margin`.
+        levels: number of levels of each control among the candidates, at least 2.
+        estimate: whether the problem is solved with half the points and steps, too, for an estimate of the error.
+
+    Raises:
+        ArgumentError: with the argument, what was expected and what was got.
+    """
+
+    def __init__(
+        self,
+        problem: ReachAvoidProblem,
+        points: int | Sequence[int] | None = None,
+        steps: int | None = None,
+        margin: Sequence[float] | None = None,
+        levels: int = 3,
+        estimate: bool = True,
+    ):
+        n = problem.states.dim
+        if n not in POINTS:
+            raise ArgumentError(f"problem: expected at most {max(POINTS)} states for a grid, got {n}")
+        points = POINTS[n] if points is None else points
+        self.points = (points,) * n if isinstance(points, int) else tuple(points)
+        if len(self.points) != n or min(self.points) < 5:
+            raise ArgumentError(f"points: expected {n} numbers >= 5, or one, got {points}")
+        self.steps = max(self.points) if steps is None else steps
+        if self.steps < 2 or levels < 2:
+            raise ArgumentError(f"steps, levels: expected both >= 2, got {self.steps} and {levels}")
+        self.margin = default_margin(problem) if margin is None else np.array(margin, float)
+        if self.margin.shape != (n,) or not (self.margin >= 0).all():
+            raise ArgumentError(f"margin: expected {n} numbers >= 0, got {margin}")
+        self.problem, self.levels, self.estimate = problem, levels, estimate
+
+    @torch.no_grad()
+    def solve(self) -> GridSolution:
+        """The value and the policy.
+
+        Raises:
+            ArgumentError: no node is outside A and B, or none is next to the target.
+        """
+        solution = self._solved(self.points, self.steps)
+        if self.estimate:
+            half = tuple(max((count + 1) // 2, 3) for count in self.points)
+            solution.coarse = self._solved(half, max(self.steps // 2, 1))
+        return solution
+
+    def _solved(self, points: Sequence[int], steps: int) -> GridSolution:
+        problem, mesh = self.problem, make_mesh(self.problem, points, self.margin)
+        nodes = mesh.states(mesh.indices())
+        inside, fixed = absorbed(problem, nodes)
+        free = np.flatnonzero(~inside)
+        controls = candidates(problem, nodes[free], mesh.spacing, self.levels)
+        chain = Chain(problem, mesh, free, controls)
+        value = problem.boundary_value(torch.from_numpy(nodes[free])).numpy()
+        if not (value.any() or any(arm.value.any() for pair in chain.axes for arm in pair)):
+            raise ArgumentError(f"points: expected a mesh that meets the target, got none of its nodes with {points}")
+        continued = _Continuation(mesh, free, fixed, chain)
+        values = np.empty((steps + 1, mesh.size), np.float32)
+        policies = np.empty((steps + 1, len(free)), np.min_scalar_type(len(controls)))
+        times = problem.horizon * np.linspace(0, 1, steps + 1) ** 2
+        values[0], policy = continued(value), np.zeros(len(free), int)
+        for step, dt in enumerate(np.diff(times), start=1):
+            value, policy = _advance(chain, value, policy, dt)
+            values[step], policies[step] = continued(value), policy
+        policies[0] = policies[1]
+        place = np.full(mesh.size, -1)
+        place[free] = np.arange(len(free))
+        around = distance_transform_edt(inside.reshape(mesh.shape), return_distances=False, return_indices=True)
+        nearest = place[mesh.flat(np.moveaxis(around, 0, -1)).ravel()]
+        return GridSolution(problem, mesh, values, policies, controls, nearest)
+
+
+def _advance(chain: Chain, before: np.ndarray, policy: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """V (M,) and the policy (M,) one step after `before` (M,), by policy iteration from `policy` (M,)."""
+    value, nodes = before, np.arange(len(before))
+    for iteration in range(ITERATIONS):
+        rates = chain.generator(value)
+        better = rates.argmax(0)
+        gained = rates[better, nodes] - rates[policy, nodes]
+        if iteration and dt * gained.max() <= TOLERANCE:
+            break
+        # A candidate that is as good as the present one does not replace it, so that the iteration cannot alternate.
+        policy = np.where(dt * gained > TOLERANCE / 10, better, policy)
+        value = _solve(chain, before, value, policy, dt)
+    return value, policy
+
+
+def _solve(chain: Chain, before: np.ndarray, guess: np.ndarray, policy: np.ndarray, dt: float) -> np.ndarray:
+    """V (M,) of a policy (M,) after one implicit step from `before` (M,)."""
+    rates, gain = chain.of(policy)
+    matrix = sparse.eye_array(len(before), format="csr") - dt * rates
+    right, diagonal = before + dt * gain, matrix.diagonal()
+    scaling = LinearOperator(matrix.shape, matvec=lambda residual: residual / diagonal)
+    value, failed = bicgstab(matrix, right, guess, rtol=0.0, atol=TOLERANCE, maxiter=1000, M=scaling)
+    return spsolve(matrix.tocsc(), right) if failed else value
+
+
+class _Continuation:
+    """Continues V linearly from the nodes outside A and B through a face to the next nodes inside."""
+
+    def __init__(self, mesh: Mesh, free: np.ndarray, fixed: np.ndarray, chain: Chain):
+        inside = np.ones(mesh.size, bool)
+        inside[free] = False
+        self._free, self._fixed, self._arms = free, fixed, []
+        self._count = np.zeros(mesh.size)
+        for arm in (arm for pair in chain.axes for arm in pair):
+            ends = np.flatnonzero(arm.cut & inside[arm.node])
+            self._arms.append((ends, arm.node[ends], arm.value[ends], arm.fraction[ends].clip(LEAST_FRACTION)))
+            np.add.at(self._count, arm.node[ends], 1)
+
+    def __call__(self, value: np.ndarray) -> np.ndarray:
+        """V (N,) at all nodes from V (M,) at the nodes outside A and B."""
+        total = np.zeros(len(self._fixed))
+        for start, node, end, fraction in self._arms:
+            total += np.bincount(node, value[start] + (end - value[start]) / fraction, len(total))
+        result = np.where(self._count > 0, total / np.maximum(self._count, 1), self._fixed)
+        result[self._free] = value
+        return result
