@@ -93,6 +93,18 @@ reference_rooms = {
             "pirl_rl.internals",
         ],
     ),
+    "grid": (
+        "The grid solver",
+        [
+            "pirl_rl.grid",
+            "pirl_rl.grid.solver",
+            "pirl_rl.grid.solution",
+            "pirl_rl.grid.mesh",
+            "pirl_rl.grid.chain",
+            "pirl_rl.grid.candidates",
+            "pirl_rl.grid.stencil",
+        ],
+    ),
     "networks": ("Networks and schedules", ["pirl_rl.networks", "pirl_rl.layers", "pirl_rl.schedules"]),
     "sampling": (
         "States and points",
@@ -106,6 +118,7 @@ reference_rooms = {
             "pirl_rl.actor_rules.hamiltonian",
             "pirl_rl.actor_rules.look_ahead",
             "pirl_rl.actor_rules.best_control",
+            "pirl_rl.ascent",
             "pirl_rl.actor_rules.clipped_surrogate",
             "pirl_rl.actor_rules.sum",
         ],

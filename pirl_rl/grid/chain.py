@@ -125,7 +125,12 @@ class Chain:
         value = np.zeros(len(offsets))
         value[cut] = absorbed(problem, mesh.states(start + step * far[:, None]))[1]
         fraction[cut] = np.maximum(far, SHORTEST)
-        return Arm(fraction, mesh.flat(self._at + offsets), cut, value)
+        node = mesh.flat(self._at + offsets)
+        # An arm that leaves the mesh ends on its edge, where the nearest node may lie in A or B.
+        stopped = np.flatnonzero(~cut & (self._unknown[node] < 0))
+        cut[stopped] = True
+        value[stopped] = absorbed(problem, mesh.states(mesh.indices()[node[stopped]]))[1]
+        return Arm(fraction, node, cut, value)
 
     def _noise(self, sigma: np.ndarray) -> Noise:
         """The noise of sigma (M, n, w)."""

@@ -1,0 +1,72 @@
+"""Accuracy and time of the grid solver: closed forms at three meshes, and Monte Carlo of its own policy in 3-D.
+
+python benchmarks/grid.py            # one and two dimensions
+python benchmarks/grid.py --dubins   # the Dubins car in three dimensions, some minutes
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import resource
+import time
+
+import torch
+
+from pirl_rl.evaluation.monte_carlo import monte_carlo
+from pirl_rl.grid import GridSolver
+from pirl_rl.problems import DubinsCar, Exit1D, HalfSpace, RadialExit, Reach1D
+
+MESHES = ((Reach1D(), (101, 201, 401)), (Exit1D(), (101, 201, 401)))
+MESHES += ((HalfSpace(dim=2), (41, 81, 121)), (RadialExit(dim=2), (41, 81, 121)))
+
+
+def states(problem, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Random states outside A and B, with times to go in the second half of the horizon."""
+    rng = torch.Generator().manual_seed(0)
+    x = problem.states.sample(4 * count, rng, torch.float64)
+    x = x[problem.interior(x)][:count]
+    return problem.horizon * (0.5 + 0.5 * torch.rand(len(x), generator=rng, dtype=x.dtype)), x
+
+
+def closed_forms() -> None:
+    """Print the largest error, its estimate, the observed order and the seconds for each mesh."""
+    print("| Problem | Points | Largest error | Estimate | Order | Seconds |")
+    print("| --- | ---: | ---: | ---: | ---: | ---: |")
+    for problem, meshes in MESHES:
+        before, previous, (tau, x) = math.nan, math.nan, states(problem, 2_000)
+        for points in meshes:
+            started = time.perf_counter()
+            solution = GridSolver(problem, points).solve()
+            seconds = time.perf_counter() - started
+            error = (solution.value(tau, x) - problem.exact_value(tau, x)).abs().max().item()
+            estimate, order = solution.error(tau, x).max().item(), math.log(before / error, points / previous)
+            name = type(problem).__name__
+            print(f"| {name} | {points} | {error:.1e} | {estimate:.1e} | {order:.2f} | {seconds:.1f} |")
+            before, previous = error, points
+
+
+def dubins(points: int, rollouts: int = 2_000) -> None:
+    """Print V against Monte Carlo of the grid's own policy at 50 states."""
+    problem, started = DubinsCar(), time.perf_counter()
+    solution = GridSolver(problem, points).solve()
+    seconds, (tau, x) = time.perf_counter() - started, states(DubinsCar(), 50)
+    played = monte_carlo(problem, solution.policy, tau, x, rollouts=rollouts, dt=0.01)
+    distance = (solution.value(tau, x) - played.probability).abs()
+    noise = (played.probability * (1 - played.probability) / rollouts).sqrt()
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    print(f"DubinsCar, {points} points, {seconds:.0f} s, {memory:.1f} GiB")
+    print(f"mean |V - MC| {distance.mean():.4f}, largest {distance.max():.4f}")
+    print(f"mean estimate of the error of V {solution.error(tau, x).mean():.4f}")
+    print(f"share of the states within three standard errors {(distance <= 3 * noise).double().mean():.2f}")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--dubins", action="store_true")
+    parser.add_argument("--points", type=int, default=51)
+    arguments = parser.parse_args()
+    if arguments.dubins:
+        dubins(arguments.points)
+    else:
+        closed_forms()

@@ -1,0 +1,194 @@
+"""The grid solver: closed forms, order, monotonicity, periodic axes, all kinds of noise, its estimate of its own error."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from pirl_rl import Box, ReachAvoidProblem
+from pirl_rl.errors import ArgumentError
+from pirl_rl.evaluation.monte_carlo import monte_carlo
+from pirl_rl.grid import GridSolver
+from pirl_rl.problems import CartPole, DoubleIntegrator, Exit1D, HalfSpace, RadialExit, Reach1D, Safety1D
+
+
+class Skewed(HalfSpace):
+    """The half-space in the coordinates z = M x, in which the two channels of the noise are correlated."""
+
+    matrix = torch.tensor([[1.0, 0.6], [0.3, 0.8]], dtype=torch.float64)
+
+    def __init__(self):
+        super().__init__(dim=2)
+        self.states = Box([-1.5, -1.5], [1.5, 1.5])
+
+    def _original(self, z: Tensor) -> Tensor:
+        return z @ self.matrix.inverse().mT.to(z)
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return u @ self.matrix.mT.to(u)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return self.matrix.to(x).expand(*x.shape, 2)
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return super().target_level(self._original(x))
+
+    def exact_value(self, tau: Tensor, x: Tensor) -> Tensor:
+        return HalfSpace(dim=2).exact_value(tau, self._original(x))
+
+
+class Restless(ReachAvoidProblem):
+    """dX = u dW with 0.2 <= u <= 1: reach x >= 1. The most noise is best, and V = 2 Phi(-(1 - x)/sqrt(tau))."""
+
+    horizon = 1.0
+    states, controls = Box([-1.0], [1.0]), Box([0.2], [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.zeros_like(x)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return u.unsqueeze(-1)
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return 1.0 - x[..., 0]
+
+    def exact_value(self, tau: Tensor, x: Tensor) -> Tensor:
+        return torch.erfc((1 - x[..., 0]).clamp(min=0) / (2 * tau).sqrt())
+
+
+class Compass(ReachAvoidProblem):
+    """d theta = u dt + 0.5 dW on the circle: turn to a heading; the needle sticks opposite to it."""
+
+    horizon = 2.0
+    states, controls = Box([-math.pi], [math.pi], periodic=[0]), Box([-1.0], [1.0])
+
+    def __init__(self, heading: float):
+        super().__init__()
+        self.heading = heading
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return u + 0.3 * torch.sin(x - self.heading)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return 0.5 * torch.ones_like(x).unsqueeze(-1)
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return 0.9 - torch.cos(x[..., 0] - self.heading)
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        return torch.cos(x[..., 0] - self.heading) + 0.99
+
+
+def points(problem: ReachAvoidProblem, count: int = 400) -> tuple[Tensor, Tensor]:
+    """Times to go in the second half of the horizon and states outside A and B."""
+    rng = torch.Generator().manual_seed(0)
+    x = problem.states.sample(count, rng, torch.float64)
+    x = x[problem.interior(x)]
+    return problem.horizon * (0.5 + 0.5 * torch.rand(len(x), generator=rng, dtype=x.dtype)), x
+
+
+def largest_error(problem: ReachAvoidProblem, count: int) -> float:
+    solution = GridSolver(problem, points=count, estimate=False).solve()
+    tau, x = points(problem)
+    return (solution.value(tau, x) - problem.exact_value(tau, x)).abs().max().item()
+
+
+@pytest.mark.parametrize(
+    ("problem", "coarse", "tolerance"),
+    [(Reach1D(), 51, 3e-3), (Exit1D(), 51, 3e-3), (Restless(), 51, 3e-3), (HalfSpace(dim=2), 21, 1e-2)],
+    ids=lambda value: type(value).__name__,
+)
+def test_the_error_falls_at_least_as_fast_as_the_mesh(problem, coarse, tolerance):
+    """The observed order, from a mesh to one four times as fine, is at least 0.9."""
+    errors = [largest_error(problem, count) for count in (coarse, 4 * (coarse - 1) + 1)]
+    assert math.log(errors[0] / errors[1], 4) >= 0.9
+    assert errors[1] <= tolerance
+
+
+@pytest.mark.parametrize("problem", [RadialExit(dim=2), Skewed()], ids=lambda problem: type(problem).__name__)
+def test_curved_faces_and_correlated_noise(problem):
+    assert largest_error(problem, 81) <= 0.01
+
+
+@pytest.mark.parametrize("problem", [Reach1D(), RadialExit(dim=2)], ids=lambda problem: type(problem).__name__)
+def test_the_estimate_bounds_the_largest_error(problem):
+    solution = GridSolver(problem, points=81).solve()
+    tau, x = points(problem)
+    error = (solution.value(tau, x) - problem.exact_value(tau, x)).abs()
+    assert error.max() <= solution.error(tau, x).max()
+    assert solution.largest_error < 0.05
+
+
+def test_the_policy_of_an_invariance_problem_points_inward():
+    problem = Safety1D()
+    solution = GridSolver(problem, points=101).solve()
+    x = torch.linspace(-0.95, 0.95, 40, dtype=torch.float64).unsqueeze(-1)
+    assert torch.equal(solution.policy(torch.ones(40), x), -x.sign())
+    assert (solution.value(torch.zeros(40), x) == 1).all()
+
+
+def test_a_larger_target_never_lowers_the_value():
+    values = []
+    for tolerance in (0.2, 0.3):
+        problem = DoubleIntegrator()
+        problem.tolerance = tolerance
+        solution = GridSolver(problem, points=41, estimate=False).solve()
+        axis = torch.linspace(-0.99, 0.99, 33, dtype=torch.float64)
+        x = torch.cartesian_prod(axis, axis)
+        values.append(solution.value(torch.full((len(x),), 2.0), x))
+    # The faces cut the arms of the mesh at other places, so that nodes next to them may move by rounding alone.
+    assert (values[1] - values[0]).min() >= -1e-6
+    assert all(((value >= 0) & (value <= 1)).all() for value in values)
+
+
+def test_degenerate_noise_agrees_with_monte_carlo_of_its_own_policy():
+    problem = DoubleIntegrator(position_noise=0.0)
+    solution = GridSolver(problem, points=121).solve()
+    tau, x = (values[:100] for values in points(problem))
+    played = monte_carlo(problem, solution.policy, tau, x, rollouts=400, dt=0.01)
+    # Without noise on the position the scheme is of first order, and its error is that of the estimate. The standard
+    # error of one probability is 0.025 at most; that of the mean over 100 states is a tenth of it.
+    distance = solution.value(tau, x) - played.probability
+    assert abs(distance.mean().item()) < solution.error(tau, x).mean() + 0.01
+    assert distance.abs().mean() < solution.error(tau, x).mean() + 0.03
+
+
+def test_a_turned_problem_on_the_circle_has_the_turned_value():
+    """The heading moves by a whole number of nodes, across the seam of the circle."""
+    count, moved = 120, 55
+    turn = 2 * math.pi * moved / count
+    values = []
+    for heading in (0.0, turn):
+        solution = GridSolver(Compass(heading), points=count, estimate=False).solve()
+        angle = torch.linspace(-6.0, 6.0, 101, dtype=torch.float64) + heading
+        values.append(solution.value(torch.full((101,), 1.5), angle.unsqueeze(-1)))
+    torch.testing.assert_close(values[0], values[1], rtol=0, atol=1e-5)
+    # Angles a whole turn apart are one state.
+    assert values[0].max() == 1
+    assert values[0].min() == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"problem": CartPole()}, "problem: expected at most 3 states for a grid, got 4"),
+        ({"problem": Reach1D(), "points": 4}, "points: expected 1 numbers >= 5, or one, got 4"),
+        ({"problem": Reach1D(), "steps": 1}, r"steps, levels: expected both >= 2, got 1 and 3"),
+        ({"problem": Reach1D(), "margin": [-1.0]}, r"margin: expected 1 numbers >= 0, got \[-1.0\]"),
+    ],
+)
+def test_arguments_that_are_refused(arguments, message):
+    with pytest.raises(ArgumentError, match=message):
+        GridSolver(**arguments)
+
+
+def test_times_and_estimates_that_there_are_not():
+    solution = GridSolver(Reach1D(), points=21, estimate=False).solve()
+    x = torch.zeros(1, 1)
+    with pytest.raises(ArgumentError, match="tau: expected 0 <= tau <= horizon = 2"):
+        solution.value(torch.tensor([2.5]), x)
+    with pytest.raises(ArgumentError, match="expected a solution with an estimate"):
+        solution.error(torch.tensor([1.0]), x)
