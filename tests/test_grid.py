@@ -1,4 +1,4 @@
-"""The grid solver: closed forms, order, monotonicity, periodic axes, all kinds of noise, its estimate of its own error."""
+"""The grid solver: closed forms, order, monotonicity, periodic axes, all kinds of noise, the estimate of its error."""
 
 from __future__ import annotations
 

@@ -7,15 +7,15 @@ enters A or B; they are 1 where it does not. The rates forward and backward are
     lambda_k (1 + c_k q) / (p (p + q)),   lambda_k (1 - c_k p) / (q (p + q)),
 
 second differences with unequal arms (G. Shortley and R. Weller, Journal of Applied Physics 9, 1938), so that faces of A
-and B lie where the level functions have them, not at nodes. They have the drift c_k lambda_k v_k. With c_k = v_k . D^-1 F
-these drifts add up to the drift F. Since rates must not be negative, c_k is limited to [-1/q, 1/p]. What then is left
-of F moves along the axes, as an upwind difference: the rate |R_i| / p for the rest R_i > 0, with p of the arm along R_i.
+and B lie where the level functions have them, not at nodes. They have the drift c_k lambda_k v_k. These drifts add up
+to the drift F for c_k = v_k . D^-1 F. Since rates must not be negative, c_k is limited to [-1/q, 1/p]. What is left of
+F moves along the axes, as an upwind difference: the rate |R_i| / p for the rest R_i > 0, with p of the arm along R_i.
 Thus the scheme has central differences, of second order, where the noise is strong enough, and is of first order else.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -92,7 +92,7 @@ class Chain:
             rates, gain = self._assembled(drift, noise)
             blocks.append(rates)
             gains.append(gain)
-        self._rates: sparse.csr_array = sparse.vstack(blocks, format="csr")
+        self._rates: Any = sparse.vstack(blocks, format="csr")
         self._gains = np.concatenate(gains)
 
     def generator(self, value: np.ndarray) -> np.ndarray:

@@ -55,7 +55,7 @@ class Mesh:
     def flat(self, indices: np.ndarray) -> np.ndarray:
         """The numbers (*) of the nodes at whole indices (*, n), wrapped or put on the edge."""
         modes = ["wrap" if axis in self.periodic else "clip" for axis in range(len(self.shape))]
-        return np.ravel_multi_index(tuple(np.moveaxis(indices, -1, 0)), self.shape, mode=tuple(modes))
+        return np.ravel_multi_index(tuple(np.moveaxis(indices, -1, 0)), self.shape, mode=tuple(modes))  # type: ignore[arg-type]
 
     def corners(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Multilinear interpolation at states (P, n): numbers (2^n, P) of nodes and their weights (2^n, P)."""
@@ -104,7 +104,7 @@ def make_mesh(problem: ReachAvoidProblem, points: Sequence[int], margin: np.ndar
     periodic, count = tuple(problem.states.periodic), np.array(points)
     spacing = width / np.where(np.isin(np.arange(len(low)), periodic), count, count - 1)
     extra = np.ceil(margin / spacing - 1e-9).astype(int)
-    wide = Mesh(low - extra * spacing, spacing, count + 2 * extra, periodic)
+    wide = Mesh(low - extra * spacing, spacing, (count + 2 * extra).tolist(), periodic)
     free = ~absorbed(problem, wide.states(wide.indices()))[0].reshape(wide.shape)
     if not free.any():
         raise ArgumentError(f"points: expected nodes outside of target and avoid set, got none with points={points}")
@@ -112,4 +112,4 @@ def make_mesh(problem: ReachAvoidProblem, points: Sequence[int], margin: np.ndar
     for axis in set(range(len(low))) - set(periodic):
         inside = np.flatnonzero(free.any(tuple(other for other in range(len(low)) if other != axis)))
         first[axis], last[axis] = max(inside[0] - 1, 0), min(inside[-1] + 1, last[axis])
-    return Mesh(wide.low + first * spacing, spacing, last - first + 1, periodic)
+    return Mesh(wide.low + first * spacing, spacing, (last - first + 1).tolist(), periodic)

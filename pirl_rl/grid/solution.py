@@ -48,8 +48,8 @@ class GridSolution:
         """V (P,) in [0, 1]: 1 in A, 0 in B and in unreachable states.
 
         With a coarse solution it is extrapolated, 2 V_fine - V_coarse, which removes an error that is proportional to
-        the distance of the nodes and the length of the steps (L. F. Richardson, Philosophical Transactions A 210, 1911).
-        In the cells of the coarse mesh that a face cuts, where the error depends on the place of the face, it is not.
+        the distance of the nodes and the length of the steps (L. F. Richardson, Phil. Trans. A 210, 1911). In the cells
+        of the coarse mesh that a face cuts, where the error depends on the place of the face, it is not.
 
         Raises:
             ArgumentError: a tau is outside [0, horizon].

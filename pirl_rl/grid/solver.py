@@ -40,8 +40,8 @@ class GridSolver:
 
     Args:
         problem: the physics, with at most three states.
-        points: number of nodes across `problem.states` along each axis, at least 5; one number serves all axes. A part of
-            A or B that is thinner than the distance of two nodes may be missed.
+        points: number of nodes across `problem.states` along each axis, at least 5; one number serves all axes. A part
+            of A or B that is thinner than the distance of two nodes may be missed.
         steps: number of steps in tau, at least 2; the default is the largest number of points.
         margin: how far the mesh goes beyond `problem.states` on each side, in SI units, one number for each axis. The
             default follows from drift, noise and horizon, see `pirl_rl.grid.mesh.default_margin`.
@@ -111,7 +111,7 @@ class GridSolver:
         place = np.full(mesh.size, -1)
         place[free] = np.arange(len(free))
         around = distance_transform_edt(inside.reshape(mesh.shape), return_distances=False, return_indices=True)
-        nearest = place[mesh.flat(np.moveaxis(around, 0, -1)).ravel()]
+        nearest = place[mesh.flat(np.moveaxis(np.asarray(around), 0, -1)).ravel()]
         return GridSolution(problem, mesh, values, policies, controls, nearest)
 
 
@@ -135,9 +135,9 @@ def _solve(chain: Chain, before: np.ndarray, guess: np.ndarray, policy: np.ndarr
     rates, gain = chain.of(policy)
     matrix = sparse.eye_array(len(before), format="csr") - dt * rates
     right, diagonal = before + dt * gain, matrix.diagonal()
-    scaling = LinearOperator(matrix.shape, matvec=lambda residual: residual / diagonal)
+    scaling = LinearOperator(matrix.shape, matvec=lambda residual: residual / diagonal)  # type: ignore[call-arg]
     value, failed = bicgstab(matrix, right, guess, rtol=0.0, atol=TOLERANCE, maxiter=1000, M=scaling)
-    return spsolve(matrix.tocsc(), right) if failed else value
+    return np.asarray(spsolve(matrix.tocsc(), right) if failed else value)
 
 
 class _Continuation:

@@ -35,7 +35,7 @@ def decompose(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     for i, j in combinations(range(size + 1), 2):
         rest = [base[:, k] for k in range(size + 1) if k not in (i, j)]
         weights.append(np.maximum(-_product(base, covariance, i, j), 0.0))
-        offsets.append(np.stack([-rest[0][:, 1], rest[0][:, 0]], -1) if size == 2 else np.cross(*rest))
+        offsets.append(np.stack([-rest[0][:, 1], rest[0][:, 0]], -1) if size == 2 else np.cross(rest[0], rest[1]))
     return np.stack(weights, 1), np.stack(offsets, 1)
 
 
