@@ -80,6 +80,30 @@ def _xavier(layers: nn.Sequential) -> None:
             nn.init.zeros_(layer.bias)
 
 
+def _spread(layers: nn.Sequential, spread: float | None) -> None:
+    """Spread the zeros of the first hidden layer over the box of the inputs; nothing happens without a spread.
+
+    By the usual initialisation all zeros pass near the middle of the box, and training has to move them first. In few
+    dimensions, where V has kinks and layers in many places, that takes most of the updates.
+
+    Raises:
+        ArgumentError: `spread` is not positive.
+    """
+    if spread is None:
+        return
+    if not spread > 0:
+        raise ArgumentError(f"spread: expected a number > 0, or None, got {spread}")
+    scaling = next(index for index, layer in enumerate(layers) if isinstance(layer, Scaling))
+    first = next(index for index, layer in enumerate(layers) if isinstance(layer, Dense))
+    dense: Dense = layers[first]  # type: ignore[assignment]
+    corners = 2 * torch.rand(dense.out_features, len(layers[scaling].scale)) - 1  # type: ignore[arg-type]
+    through = layers[scaling + 1 : first](corners)
+    with torch.no_grad():
+        direction = nn.functional.normalize(torch.randn_like(dense.weight), dim=-1)
+        dense.weight.copy_(2 * spread * torch.rand(dense.out_features, 1) * direction)
+        dense.bias.copy_(-(dense.weight * through).sum(-1))
+
+
 class Actor(nn.Module):
     """The policy pi(tau, x): maps tau (N, 1), in s, and x (N, n) to the control (N, m), normalised to [-1, 1].
 
@@ -89,9 +113,13 @@ class Actor(nn.Module):
         activation: name of a layer of `torch.nn`.
         scaling: box of states that the first layer maps to [-1, 1]^n; default `problem.states`, which gives the periods
             of periodic axes in any case.
+        root_time: whether sqrt(tau) is an input beside tau, see `RootTime`.
+        spread: the mean slope of the neurons of the first layer in the scaled inputs. Their zeros then pass through
+            points that are uniform in the box. None takes the usual initialisation, for which all zeros pass near the
+            middle of the box.
 
     Raises:
-        ArgumentError: `activation` is not the name of a layer of `torch.nn`.
+        ArgumentError: `activation` is not the name of a layer of `torch.nn`, or `spread` is not positive.
     """
 
     def __init__(
@@ -100,10 +128,12 @@ class Actor(nn.Module):
         hidden: Sequence[int] = (32, 32),
         activation: str = "ReLU",
         scaling: Box | None = None,
+        root_time: bool = False,
+        spread: float | None = None,
     ):
         super().__init__()
-        outputs = problem.controls.dim
-        self.layers = _stack(problem, 0, hidden, outputs, activation, "Tanh", root_time=False, scaling=scaling)
+        self.layers = _stack(problem, 0, hidden, problem.controls.dim, activation, "Tanh", root_time, scaling)
+        _spread(self.layers, spread)
 
     def logits(self, tau: Tensor, state: Tensor) -> Tensor:
         """The output (N, m) before the hyperbolic tangent of the last layer."""
@@ -127,9 +157,12 @@ class Critic(nn.Module):
             infinite weights. None is a linear output, which attains both.
         scaling: box of states that the first layer maps to [-1, 1]^n; default `problem.states`, which gives the periods
             of periodic axes in any case.
+        spread: the mean slope of the neurons of the first layer in the scaled inputs. Their zeros then pass through
+            points that are uniform in the box. None takes the usual initialisation, for which all zeros pass near the
+            middle of the box.
 
     Raises:
-        ArgumentError: `activation` or `output` is not the name of a layer of `torch.nn`.
+        ArgumentError: `activation` or `output` is not the name of a layer of `torch.nn`, or `spread` is not positive.
     """
 
     def __init__(
@@ -141,12 +174,14 @@ class Critic(nn.Module):
         root_time: bool = True,
         output: Literal["Sigmoid"] | None = None,
         scaling: Box | None = None,
+        spread: float | None = None,
     ):
         super().__init__()
         self.action_input = action_input
         controls = problem.controls.dim if action_input else 0
         self.layers = _stack(problem, controls, hidden, 1, activation, output, root_time, scaling)
         _xavier(self.layers)
+        _spread(self.layers, spread)
 
     def inputs(self, tau: Tensor, state: Tensor, action: Tensor) -> Tensor:
         """The input (N, d) of the first layer: (tau, x, u), or (tau, x) for a critic V(tau, x)."""

@@ -1,0 +1,69 @@
+"""Networks: the initialisation of their first layer."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from pirl_rl.errors import ArgumentError
+from pirl_rl.layers import Dense, Scaling
+from pirl_rl.networks import Actor, Critic
+from pirl_rl.problems import DubinsCar, HalfSpace, ZermeloBoat
+
+WIDTH = 512
+
+
+def networks(problem, **arguments):
+    return Actor(problem, (WIDTH,), **arguments), Critic(problem, (WIDTH, 8), **arguments)
+
+
+def first_dense(network) -> Dense:
+    return next(layer for layer in network.layers if isinstance(layer, Dense))
+
+
+@pytest.mark.parametrize("problem", [ZermeloBoat(), HalfSpace(dim=8)], ids=["2", "8"])
+def test_zeros_of_spread_neurons_pass_through_the_box(problem):
+    torch.manual_seed(0)
+    for network in networks(problem, root_time=True, spread=3.0):
+        dense = first_dense(network)
+        slope = dense.weight.norm(dim=-1)
+        # 2 * 3 * U with U uniform: the mean is 3, and its standard error 3 / sqrt(3 * 512).
+        assert slope.max() <= 6
+        assert abs(slope.mean().item() - 3) < 4 * 3 / (3 * WIDTH) ** 0.5
+        # A plane meets the box [-1, 1]^d if and only if |b| <= sum |w_i|.
+        assert (dense.bias.abs() <= dense.weight.abs().sum(-1)).all()
+        # The distances of the planes from the middle spread over the box: U has the standard deviation 1/sqrt(3).
+        distance = dense.bias / slope
+        assert abs(distance.std().item() * 3**0.5 - 1) < 0.15
+
+
+def test_the_zeros_of_a_periodic_coordinate_lie_on_its_circle():
+    torch.manual_seed(0)
+    critic = Critic(DubinsCar(), (WIDTH,), spread=3.0)
+    dense = first_dense(critic)
+    *prefix, _, _ = critic.layers
+    assert any(isinstance(layer, Scaling) for layer in prefix)
+    # Inputs are tau, x_1, x_2, sin, sqrt(tau), cos: no plane is farther out than box and circle together.
+    circle = dense.weight[:, [3, 5]].norm(dim=-1)
+    assert (dense.bias.abs() <= dense.weight[:, [0, 1, 2, 4]].abs().sum(-1) + circle + 1e-5).all()
+
+
+def test_without_a_spread_the_initialisation_is_the_usual_one():
+    for spread in (None, 3.0):
+        torch.manual_seed(0)
+        _, critic = networks(ZermeloBoat(), spread=spread)
+        dense = first_dense(critic)
+        bound = (6 / (dense.in_features + WIDTH)) ** 0.5
+        assert ((dense.bias == 0).all() and (dense.weight.abs() <= bound).all()) == (spread is None)
+
+
+@pytest.mark.parametrize("spread", [0.0, -1.0])
+def test_spreads_that_are_refused(spread):
+    with pytest.raises(ArgumentError, match=f"spread: expected a number > 0, or None, got {spread}"):
+        Critic(ZermeloBoat(), spread=spread)
+
+
+def test_an_actor_may_have_the_root_of_time():
+    actor = Actor(ZermeloBoat(), root_time=True)
+    assert first_dense(actor).in_features == 4
+    assert actor(torch.rand(5, 1), torch.rand(5, 2)).shape == (5, 2)
