@@ -41,6 +41,8 @@ class ReachAvoidEnv(EnvBase):
         num_envs: the number of paths N.
         seed: the seed of the random generator; None draws one from torch's default generator.
         device: the device of all tensors.
+        compile_simulator: whether the simulator is compiled. Where that fails, it runs eagerly after one warning.
+            (TorchRL's own argument `compile` would compile a whole step with its resets, which breaks into pieces.)
 
     Raises:
         ProblemError: the problem contradicts itself, see `check_problem`.
@@ -59,13 +61,14 @@ class ReachAvoidEnv(EnvBase):
         num_envs: int = 256,
         seed: int | None = None,
         device: torch.device | str = "cpu",
+        compile_simulator: bool = False,
     ):
         check_problem(problem)
         if not (isinstance(num_envs, int) and num_envs >= 1):
             raise ArgumentError(f"num_envs: expected an integer >= 1, got {num_envs!r}")
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.problem = problem
-        self.simulator = Simulator(problem, dt, substeps, crossing)  # type: ignore[arg-type]
+        self.simulator = Simulator(problem, dt, substeps, crossing, compile_simulator)  # type: ignore[arg-type]
         self.initial_states: InitialStates = initial_states or UniformStates()
         self.max_steps = self.simulator.clock.max_steps
         self._make_specs()
@@ -75,10 +78,8 @@ class ReachAvoidEnv(EnvBase):
     def recipe(self, seed: int) -> Callable[[], ReachAvoidEnv]:
         """A picklable function that builds a copy of this environment on the CPU, with the given seed."""
         steps = {name: getattr(self.simulator, name) for name in ("dt", "substeps", "crossing")}
-        envs = self.batch_size[0]
-        return partial(
-            ReachAvoidEnv, self.problem, **steps, initial_states=self.initial_states, num_envs=envs, seed=seed
-        )
+        others = {"initial_states": self.initial_states, "num_envs": self.batch_size[0], "seed": seed}
+        return partial(ReachAvoidEnv, self.problem, **steps, **others, compile_simulator=self.simulator.compile)
 
     def _make_specs(self) -> None:
         problem, bs, device = self.problem, self.batch_size, self.device

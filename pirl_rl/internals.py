@@ -1,11 +1,10 @@
-"""The private names of torch and TorchRL on which this package relies; check them when a version changes."""
+"""The private names of TorchRL on which this package relies; check them when a version changes."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from tensordict import TensorDictBase
-from torch._dynamo.exc import BackendCompilerFailed
 from torchrl.collectors import Collector
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives import TD3Loss
@@ -13,7 +12,6 @@ from torchrl.objectives import TD3Loss
 from pirl_rl.schedules import WEIGHTS
 
 __all__ = [
-    "BackendCompilerFailed",
     "ScheduledTD3Loss",
     "carried",
     "lock_writes_with",

@@ -12,9 +12,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import SoftUpdate
 
+from pirl_rl.compilation import is_compiler_failure
 from pirl_rl.curriculum import StageSettings
 from pirl_rl.errors import ArgumentError, DivergenceError
-from pirl_rl.internals import BackendCompilerFailed
 from pirl_rl.losses import PIRLLoss
 from pirl_rl.schedules import WEIGHTS, Weights
 
@@ -165,8 +165,8 @@ class Learner:
 
         try:
             return evaluate()
-        except BackendCompilerFailed as error:
-            if not self.compile:
+        except Exception as error:
+            if not self.compile or not is_compiler_failure(error):
                 raise
             self.compile = False
             self._compile_critic_loss()

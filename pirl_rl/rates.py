@@ -14,17 +14,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from pirl_rl.descent import descended
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.sets import Box
-
-DESCENT = 200
-"""Steps of the descent by which deep points of a set are found."""
-
-FIRST, LAST = 0.05, 1e-4
-"""Sizes of the first and the last of these steps, in coordinates in which the box is [-1, 1]^n."""
 
 STARTS = 64
-"""Points from which the descent starts."""
+"""The number of states of lowest level from which the descent to deep points of a set starts."""
 
 DIFFERENCE = 1e-6
 """Half the step of the differences in the drift's Jacobian, in half widths of the box."""
@@ -99,7 +93,8 @@ def _across(
     problem: ReachAvoidProblem, name: str, constraints: Callable[[Tensor], Tensor], x: Tensor, u: Tensor
 ) -> list[Move]:
     """The rates across each constraint of the set in which all of them hold, at points inside it."""
-    inside = torch.cat([x, _descended(constraints, x, problem.states)])
+    lowest = x[constraints(x).amax(-1).argsort()[:STARTS]]
+    inside = torch.cat([x, descended(constraints, lowest, problem.states)])
     inside = inside[(constraints(inside) <= 0).all(-1)]
     if not len(inside):
         return []
@@ -110,22 +105,3 @@ def _across(
     spread = torch.stack(columns).norm(dim=0).median(0).values
     rates = zip((-constraints(inside)).amax(0).tolist(), speed.tolist(), spread.tolist(), strict=True)
     return [Move(name, v / depth, s / depth) for depth, v, s in rates if depth > 0]
-
-
-def _descended(constraints: Callable[[Tensor], Tensor], x: Tensor, box: Box) -> Tensor:
-    """Deep points of a set: descent of its level from the lowest of the states x, within twice the box."""
-
-    def level(z: Tensor) -> Tensor:
-        return constraints(box.wrap(box.denormalize(z))).amax(-1)
-
-    z = box.normalize(x)
-    z = z[level(z).argsort()[:STARTS]].clone().requires_grad_()
-    slope, optimizer = torch.func.grad(lambda z: level(z).sum()), torch.optim.Adam([z], lr=FIRST)
-    decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST / FIRST) ** (1 / DESCENT))
-    for _ in range(DESCENT):
-        z.grad = slope(z.detach())
-        optimizer.step()
-        decay.step()
-        with torch.no_grad():
-            z.clamp_(-2, 2)
-    return box.wrap(box.denormalize(z.detach()))

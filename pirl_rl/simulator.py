@@ -16,6 +16,7 @@ into their period at the end of each sub-step, before levels are taken there.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple
@@ -24,6 +25,7 @@ import torch
 from torch import Tensor
 
 from pirl_rl.clock import Clock
+from pirl_rl.compilation import Compiled
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
 
@@ -60,6 +62,7 @@ class Simulator:
         dt: the length of a control step, in s.
         substeps: the number of integration steps in a control step.
         crossing: "bridge" or "endpoint", how exits within a sub-step are detected.
+        compile: whether a sub-step is compiled, for one fixed number N of paths; the random numbers stay the same.
 
     Raises:
         ArgumentError: `dt` is not in (0, horizon], `substeps` is below 1, or `crossing` is unknown.
@@ -69,6 +72,7 @@ class Simulator:
     dt: float = 0.1
     substeps: int = 1
     crossing: Literal["bridge", "endpoint"] = "bridge"
+    compile: bool = False
 
     def __post_init__(self):
         if not 0 < self.dt <= self.problem.horizon:
@@ -82,6 +86,10 @@ class Simulator:
     def clock(self) -> Clock:
         """Counts the control steps of the problem's horizon."""
         return Clock(self.dt, self.problem.horizon)
+
+    @cached_property
+    def _advanced(self) -> Callable[..., tuple[Tensor, Tensor, Tensor, Tensor]]:
+        return Compiled(self._advance, "the simulator") if self.compile else self._advance
 
     @torch.no_grad()
     def step(self, x: Tensor, u: Tensor, rng: torch.Generator | None = None, dt: Tensor | None = None) -> Step:
@@ -99,8 +107,7 @@ class Simulator:
         reached = torch.zeros(x.shape[:-1], dtype=torch.bool, device=x.device)
         failed, noise = reached, x
         for index in range(self.substeps):
-            moved, kick, sigma = self._euler_maruyama(x, u, h, rng)
-            now_reached, now_failed = self._exits(x, moved, sigma, h, rng)
+            moved, kick, now_reached, now_failed = self._advanced(x, u, h, *self._draw(x, rng))
             if index == 0:
                 x, reached, failed, noise = moved, now_reached & ~now_failed, now_failed, kick
                 continue
@@ -124,32 +131,49 @@ class Simulator:
             x = self.problem.states.wrap(x + self.problem.drift(x, u) * h)
         return x
 
-    def _euler_maruyama(self, x: Tensor, u: Tensor, h: Tensor, rng) -> tuple[Tensor, Tensor, Tensor]:
-        sigma = self.problem.diffusion(x, u)
-        channels = sigma.shape[-1]
-        noise = torch.randn((channels, *x.shape[:-1]), generator=rng, dtype=x.dtype, device=x.device) * h.sqrt()
+    def _draw(self, x: Tensor, rng: torch.Generator | None) -> tuple[Tensor, Tensor | None, Tensor | None]:
+        """The random numbers of a sub-step: normal (w, N), and uniform (N, k) for the faces of A and of B.
+
+        They are drawn here, so that `_advance` is a function without side effects, which can be compiled.
+        """
+        channels, *faces = self._random_numbers
+        kind = {"generator": rng, "dtype": x.dtype, "device": x.device}
+        normal = torch.randn((channels, *x.shape[:-1]), **kind)
+        target, avoid = (torch.rand((*x.shape[:-1], count), **kind) if count else None for count in faces)
+        return normal, target, avoid
+
+    @cached_property
+    def _random_numbers(self) -> tuple[int, int, int]:
+        """The number w of noise channels, and of the constraints of A and of B whose crossings are drawn."""
+        problem, bridge, rng = self.problem, self.crossing == "bridge", torch.Generator().manual_seed(0)
+        x, u = problem.states.sample(2, rng), problem.controls.sample(2, rng)
+        target = problem.reached_constraints(x).shape[-1] if bridge and problem.objective == "reach-avoid" else 0
+        avoid = problem.avoid_constraints(x).shape[-1] if bridge and problem.has_avoid_set else 0
+        return problem.diffusion(x, u).shape[-1], target, avoid
+
+    def _advance(
+        self, x: Tensor, u: Tensor, h: Tensor, normal: Tensor, target: Tensor | None, avoid: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """One sub-step: states (N, n), sigma dW (N, n), and whether paths are in A and in B or crossed a face."""
+        problem, sigma = self.problem, self.problem.diffusion(x, u)
+        noise = normal * h.sqrt()
         if all(stride == 0 for stride in sigma.stride()[:-2]):
             # sigma is one matrix, expanded to all states: one product of two matrices replaces N small ones.
-            moved = (sigma[(0,) * (sigma.ndim - 2)] @ noise).mT
+            kick = (sigma[(0,) * (sigma.ndim - 2)] @ noise).mT
         else:
-            moved = (sigma * noise.movedim(0, -1).unsqueeze(-2)).sum(-1)
-        return self.problem.states.wrap(x + self.problem.drift(x, u) * h[..., None] + moved), moved, sigma
-
-    def _exits(self, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor, rng) -> tuple[Tensor, Tensor]:
-        problem = self.problem
+            kick = (sigma * noise.movedim(0, -1).unsqueeze(-2)).sum(-1)
+        moved = problem.states.wrap(x + problem.drift(x, u) * h[..., None] + kick)
         reached, failed = problem.reached(moved), problem.failed(moved)
-        if self.crossing == "endpoint":
-            return reached, failed
-        if problem.objective == "reach-avoid":
-            crossed, others_hold = self._crossed(problem.reached_constraints, x, moved, sigma, h, rng)
+        if target is not None:
+            crossed, others_hold = self._crossed(problem.reached_constraints, x, moved, sigma, h, target)
             reached = reached | (crossed & others_hold).any(-1)
-        if problem.has_avoid_set:
-            crossed, _ = self._crossed(problem.avoid_constraints, x, moved, sigma, h, rng)
+        if avoid is not None:
+            crossed, _ = self._crossed(problem.avoid_constraints, x, moved, sigma, h, avoid)
             failed = failed | crossed.any(-1)
-        return reached, failed
+        return moved, kick, reached, failed
 
     @staticmethod
-    def _crossed(constraints, x, moved, sigma, h, rng) -> tuple[Tensor, Tensor]:
+    def _crossed(constraints, x, moved, sigma, h, uniform) -> tuple[Tensor, Tensor]:
         """Whether the bridge crossed each face, and whether all other constraints hold at both ends; (N, k) bool."""
         before, after = constraints(x), constraints(moved)
         columns = [torch.func.jvp(constraints, (x,), (column,))[1] for column in sigma.unbind(-1)]
@@ -157,7 +181,6 @@ class Simulator:
         exponent = -2 * before * after / variance
         # Where the variance is 0, the exponent is NaN or infinite, and the face is not crossed between the ends.
         probability = torch.where((variance > 0) & (before > 0) & (after > 0), exponent.exp(), torch.zeros_like(before))
-        crossed = torch.rand(before.shape, generator=rng, dtype=x.dtype, device=x.device) < probability
         held = (before <= 0) & (after <= 0)
         others_hold = held.sum(-1, keepdim=True) - held.long() == before.shape[-1] - 1
-        return crossed, others_hold
+        return uniform < probability, others_hold

@@ -137,10 +137,14 @@ def test_sizes_add_up_and_draws_differ():
 
 
 class Needle(Reach1D):
-    """A target too thin for sampling."""
+    """A target of a given half-width, which sampling misses; its level has a slope only outside."""
+
+    def __init__(self, half_width=1e-5):
+        super().__init__()
+        self.half_width = half_width
 
     def target_level(self, x):
-        return (x[..., 0] - 1).abs() - 1e-9
+        return (x[..., 0] - 1).abs() - self.half_width
 
 
 class MarkedNeedle(Needle):
@@ -148,9 +152,42 @@ class MarkedNeedle(Needle):
         return torch.ones(count, 1, dtype=torch.float64), torch.ones(count, dtype=torch.float64)
 
 
-def test_a_set_too_thin_to_be_found_is_named_and_its_own_faces_are_taken():
-    with pytest.raises(ProblemError, match=r"Needle: neither target nor avoid set found .* give faces"):
-        BoundarySampler(Needle())
+class Walls(Reach1D):
+    """A thick and a thin part of the avoid set."""
+
+    def target_level(self, x):
+        return (x[..., 0] - 1.5).abs() - 0.1
+
+    def avoid_constraints(self, x):
+        return torch.stack([x[..., 0] + 1.5, (x[..., 0] - 0.5).abs() - 1e-5], -1)
+
+
+class Nowhere(Reach1D):
+    def target_level(self, x):
+        return (x[..., 0] - 10).abs() - 0.1
+
+
+def test_a_set_too_thin_for_sampling_is_found_by_descent():
+    points = BoundarySampler(Needle(), initial=0, faces=100).sample(make_rng())
+    assert ((points["state"] - 1).abs() - 1e-5).abs().max() < 1e-6
+    assert (points["value"] == 1).all()
+
+
+def test_every_part_of_an_avoid_set_is_found():
+    x = BoundarySampler(Walls(), initial=0, faces=3_000).sample(make_rng())["state"]
+    for face in (1.4, 1.6, -1.5, 0.5):
+        assert ((x - face).abs() < 2e-5).float().mean() > 0.05
+
+
+@pytest.mark.parametrize("problem", [Needle(1e-9), Nowhere()])
+def test_a_set_that_is_not_found_is_named(problem):
+    with pytest.raises(
+        ProblemError, match=rf"{type(problem).__name__}: no point of the target was found, neither .* nor"
+    ):
+        BoundarySampler(problem)
+
+
+def test_faces_that_the_problem_gives_are_taken():
     points = BoundarySampler(MarkedNeedle(), initial=0, faces=10).sample(make_rng())
     assert torch.equal(points["state"], torch.ones(10, 1))
     assert torch.equal(points["value"], torch.ones(10))

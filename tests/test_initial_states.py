@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from oracles import PROBLEMS, name
@@ -9,6 +11,7 @@ from oracles import PROBLEMS, name
 from pirl_rl.errors import ProblemError
 from pirl_rl.problems import Reach1D, Safety1D, VehicleDrift
 from pirl_rl.problems.drift.starts import EquilibriumStates
+from pirl_rl.sampling.faces import NearFaces
 from pirl_rl.sampling.initial_states import UniformStates, VisitedStates, sample_interior
 from pirl_rl.sets import Box
 
@@ -142,6 +145,27 @@ def test_visited_states_take_their_share():
     assert not (none - visited).abs().amax(-1).lt(1e-5).any()
 
 
+def test_the_distances_of_states_near_faces_are_log_uniform():
+    """A state is 10^-4U D from the face at 2, with D uniform in (0, 6): a decade below has a quarter of these states.
+
+    The mean of log10(D) is log10(6) - 1/log(10). The shares have a standard error of 0.003.
+    """
+    _, x = draw(Reach1D(), NearFaces(UniformStates(), 0.7, 4.0))
+    distance = 2 - x[:, 0].double()
+    assert Reach1D().interior(x).all()
+    below = (distance < 4e-3).double().mean().item()
+    assert below == pytest.approx(0.7 * (1 - (math.log10(6 / 4e-3) - 1 / math.log(10)) / 4), abs=0.015)
+    decades = [((distance > edge) & (distance < 10 * edge)).double().mean().item() for edge in (1e-3, 1e-2)]
+    assert decades == pytest.approx([0.7 / 4] * 2, abs=0.015)
+
+
+@pytest.mark.parametrize("problem", PROBLEMS, ids=name)
+def test_states_near_faces_are_outside_both_sets(problem):
+    steps, x = draw(problem, NearFaces(UniformStates(), 1.0))
+    assert problem.interior(x).all()
+    assert (steps.min(), steps.max()) == (1, 20)
+
+
 @pytest.mark.parametrize(
     ("law", "message"),
     [
@@ -150,6 +174,8 @@ def test_visited_states_take_their_share():
         (lambda: EquilibriumStates(1.0, (1, 0)), "initial_states.mixture: expected three shares"),
         (lambda: EquilibriumStates(tau="late"), "initial_states.tau"),
         (lambda: VisitedStates(UniformStates(), 1.5), "0 <= share <= 1"),
+        (lambda: NearFaces(UniformStates(), -0.1), "0 <= share <= 1"),
+        (lambda: NearFaces(UniformStates(), decades=0.0), "decades > 0"),
     ],
 )
 def test_drift_laws_name_the_key(law, message):

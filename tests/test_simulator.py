@@ -6,6 +6,7 @@ Statistical tests have fixed seeds and ask for agreement within three standard e
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,8 @@ from torch import Tensor
 
 from pirl_rl.networks import Critic
 from pirl_rl.operators import generator
-from pirl_rl.problems import Reach1D, Safety1D
+from pirl_rl.problems import Reach1D, Safety1D, ZermeloBoat
+from pirl_rl.sampling.initial_states import sample_interior
 from pirl_rl.sets import Box
 from pirl_rl.simulator import Simulator
 
@@ -257,3 +259,19 @@ def test_a_face_without_noise_is_not_crossed_between_the_ends():
 def test_wrong_steps_are_named(kwargs, message):
     with pytest.raises(ValueError, match=message):
         Simulator(Reach1D(), **kwargs)
+
+
+@pytest.mark.parametrize("problem", [Reach1D(), ZermeloBoat()], ids=["one matrix of noise", "walls and a rock"])
+def test_a_compiled_simulator_draws_the_same_random_numbers(problem, monkeypatch):
+    """The compiler's front end alone is used; what it makes of it is compared in single precision."""
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager", fullgraph=True))
+    x = sample_interior(problem, problem.states, 500, torch.Generator().manual_seed(0), torch.float32)
+    u = problem.controls.sample(500, torch.Generator().manual_seed(1))
+    eager, compiled = (
+        Simulator(problem, 0.1, 3, compile=compile).step(x, u, torch.Generator().manual_seed(2))
+        for compile in (False, True)
+    )
+    torch.testing.assert_close(compiled.state, eager.state)
+    assert torch.equal(compiled.reached, eager.reached)
+    assert torch.equal(compiled.failed, eager.failed)
+    assert (eager.reached | eager.failed).any()

@@ -7,24 +7,17 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 
-from pirl_rl.errors import ArgumentError, ProblemError
+from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.sampling.faces import find_faces
 from pirl_rl.sampling.initial_states import sample_interior
-
-FACE_POOL = 16_384
-"""The number of points on the faces that are found once, and from which samples are drawn."""
-
-BISECTIONS = 50
-"""The number of halvings of a segment between a point inside a set and one outside; enough for double precision."""
 
 
 class BoundarySampler:
     """Samples points at tau = 0, and on the faces of A and B at tau in (0, T], with the value V there.
 
-    The points on the faces are drawn from a pool, which `problem.faces` gives. If it gives none, the pool is found by
-    bisection of the level functions between points inside and outside the sets, in a box twice as wide as `states`.
+    The points on the faces are drawn from a pool, see `pirl_rl.sampling.faces`.
 
     Args:
         problem: gives the sets and the boundary values.
@@ -37,7 +30,7 @@ class BoundarySampler:
 
     Raises:
         ArgumentError: a number is out of range.
-        ProblemError: the problem gives no faces, and bisection finds none.
+        ProblemError: a set of the problem is not found.
     """
 
     def __init__(
@@ -61,7 +54,7 @@ class BoundarySampler:
             raise ArgumentError(f"boundary.replay_share: expected 0 <= replay_share <= 1, got {replay_share}")
         self.replay_share, self.box = replay_share, problem.states.expand(widen)
         rng = torch.Generator().manual_seed(seed)
-        self._pool = _face_pool(problem, rng)
+        self._pool = find_faces(problem, rng)
 
     def sample(self, rng: torch.Generator, replay: TensorDictBase | None = None) -> TensorDict:
         """Draw N = initial + faces points.
@@ -81,49 +74,9 @@ class BoundarySampler:
             state = torch.cat([replay["state"][index], state[visited:]])
         value, tau = self.problem.boundary_value(state), torch.zeros(self.initial, 1, device=device)
         if self.faces:
-            points, values = (entry.to(device) for entry in self._pool)
+            points, values = self._pool.points.to(device), self._pool.values.to(device)
             index = torch.randint(len(points), (self.faces,), generator=rng, device=device)
             late = 1 - torch.rand(self.faces, 1, generator=rng, device=device)
             tau = torch.cat([tau, self.problem.horizon * late**self.tau_power])
             state, value = torch.cat([state, points[index]]), torch.cat([value, values[index]])
         return TensorDict({"tau": tau, "state": state, "value": value}, batch_size=[len(tau)])
-
-
-def _face_pool(problem: ReachAvoidProblem, rng: torch.Generator) -> tuple[Tensor, Tensor]:
-    given = problem.faces(FACE_POOL, rng)
-    if given is not None:
-        points, values = given
-        points = problem.states.wrap(points)
-        return points.to(torch.get_default_dtype()), values.to(torch.get_default_dtype())
-    wide = problem.states.expand(2.0)
-    candidates = wide.sample(4 * FACE_POOL, rng, dtype=torch.float64)
-    reached, failed = problem.reached(candidates), problem.failed(candidates)
-    outside = candidates[~(reached | failed)]
-    points, values = [], []
-    for inside, absorbs, value in (
-        (candidates[reached], problem.reached, 1.0),
-        (candidates[failed], problem.failed, 0.0),
-    ):
-        if len(inside) and len(outside):
-            count = FACE_POOL // 2
-            a = inside[torch.randint(len(inside), (count,), generator=rng)]
-            b = outside[torch.randint(len(outside), (count,), generator=rng)]
-            face = _bisect(absorbs, a, b)
-            near = wide.contains(face)
-            points.append(face[near])
-            values.append(torch.full((int(near.sum()),), value))
-    if not points:
-        raise ProblemError(
-            f"{type(problem).__name__}: neither target nor avoid set found among {len(candidates)} points of {wide}; "
-            "give faces(count, rng), which is needed for sets this thin"
-        )
-    return torch.cat(points).to(torch.get_default_dtype()), torch.cat(values).to(torch.get_default_dtype())
-
-
-def _bisect(absorbs, inside: Tensor, outside: Tensor) -> Tensor:
-    """The points (N, n) at which the segments from points inside to points outside leave the set."""
-    for _ in range(BISECTIONS):
-        middle = (inside + outside) / 2
-        held = absorbs(middle).unsqueeze(-1)
-        inside, outside = torch.where(held, middle, inside), torch.where(held, outside, middle)
-    return inside

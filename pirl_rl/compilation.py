@@ -1,0 +1,42 @@
+"""Functions that are compiled, and that run eagerly where no compiler is found."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+
+class Compiled:
+    """A function that is compiled at its first call; where that fails, it runs eagerly after one warning.
+
+    Args:
+        function: maps tensors to tensors, without side effects.
+        name: of the function, for the warning.
+    """
+
+    def __init__(self, function: Callable[..., Any], name: str):
+        self.function, self.name = function, name
+        self._called: Callable[..., Any] = torch.compile(function)
+
+    def __call__(self, *args: Any) -> Any:
+        try:
+            return self._called(*args)
+        except Exception as error:
+            if self._called is self.function or not is_compiler_failure(error):
+                raise
+            reason = str(error).partition("\n")[0]
+            warnings.warn(f"{self.name} runs eagerly, which is slower: {reason}", stacklevel=2)
+            self._called = self.function
+            return self.function(*args)
+
+
+def is_compiler_failure(error: Exception) -> bool:
+    """Whether an error comes from the compiler, as without a C++ compiler, and not from the compiled function."""
+    # The compiler takes a second to import, which commands that compile nothing need not spend.
+    from torch._dynamo.exc import TorchDynamoException
+    from torch._inductor.exc import InductorError
+
+    return isinstance(error, (TorchDynamoException, InductorError))

@@ -1,0 +1,42 @@
+"""Descent of level functions, which finds points of a set that is too thin to be hit by sampling."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from pirl_rl.sets import Box
+
+STEPS = 400
+"""The number of steps of the descent."""
+
+FIRST, LAST = 0.05, 1e-6
+"""Sizes of the first and the last of these steps, in coordinates in which the box is [-1, 1]^n."""
+
+
+def descended(constraints: Callable[[Tensor], Tensor], x: Tensor, box: Box) -> Tensor:
+    """Points (N, n) where the largest of several levels is low, found by Adam from the states x (N, n).
+
+    They stay within a box twice as wide as `box`, and need not lie in the set.
+
+    Args:
+        constraints: the levels (N, k) at states (N, n), differentiable; all of them are <= 0 in the set.
+        x: where the descent starts.
+        box: gives the scale of the steps.
+    """
+
+    def level(z: Tensor) -> Tensor:
+        return constraints(box.wrap(box.denormalize(z))).amax(-1)
+
+    z = box.normalize(x).clone().requires_grad_()
+    slope, optimizer = torch.func.grad(lambda z: level(z).sum()), torch.optim.Adam([z], lr=FIRST)
+    decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST / FIRST) ** (1 / STEPS))
+    for _ in range(STEPS):
+        z.grad = slope(z.detach())
+        optimizer.step()
+        decay.step()
+        with torch.no_grad():
+            z.clamp_(-2, 2)
+    return box.wrap(box.denormalize(z.detach()))
