@@ -17,6 +17,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from pirl_rl.problem import has_controlled_noise
+from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
 Objective = Callable[[Tensor], Tensor]
@@ -42,6 +44,38 @@ def hamiltonian(solution: Solution, tau: Tensor, x: Tensor, controlled_noise: bo
             return along
         sigma = problem.diffusion(x, u)
         return along + (sigma * (curvature @ sigma)).sum((-2, -1)) / 2
+
+    return value
+
+
+def value_ahead(solution: Solution, simulator: Simulator, tau: Tensor, x: Tensor, steps: int) -> Objective:
+    """V after a few control steps without noise, as a function of the action (N, m) that is held over them.
+
+    A path stops at the end of the step in which it enters A or B, and at tau = 0. Where sigma depends on the control,
+    the expectation of the noise's effect is added to first order: 1/2 Tr(sigma sigma^T hess V) at x times the length.
+
+    Args:
+        solution: gives V and the problem.
+        simulator: simulates the control steps.
+        tau: times to go (N,), in s.
+        x: states (N, n).
+        steps: the number of control steps, at least 1.
+    """
+    problem, clock = solution.problem, simulator.clock
+    curvature = solution.hessian(tau, x) if has_controlled_noise(problem) else None
+
+    def value(action: Tensor) -> Tensor:
+        u, t, y = problem.controls.denormalize(action), tau, x
+        for _ in range(steps):
+            left, shortfall = clock.split(t)
+            live, h = problem.interior(y) & (left > 0), clock.length(left, shortfall).to(y)
+            y = torch.where(live.unsqueeze(-1), simulator.flow(y, u, h), y)
+            t = torch.where(live, t - h, t).clamp(min=0)
+        ahead = solution.value(t, y)
+        if curvature is None:
+            return ahead
+        sigma = problem.diffusion(x, u)
+        return ahead + (tau - t) * (sigma * (curvature @ sigma)).sum((-2, -1)) / 2
 
     return value
 

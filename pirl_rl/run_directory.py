@@ -6,6 +6,7 @@ metrics.csv             one row of metrics for each logged update
 summary.json            the metrics of the final evaluation, and the length of the training
 evaluation.json         the metrics of a later `python -m pirl_rl.evaluate`
 checkpoints/            last.pt, from which the run can be resumed, and weights-<update>.pt with the networks
+grid.npz                the value and the policy on a mesh, in place of checkpoints, of a run with method=grid
 figures/                PNG files
 """
 
@@ -34,6 +35,7 @@ class RunDirectory:
     EVALUATION = Path("evaluation.json")
     CHECKPOINTS = Path("checkpoints")
     LAST = CHECKPOINTS / "last.pt"
+    GRID = Path("grid.npz")
     FIGURES = Path("figures")
 
     def __init__(self, path: str | os.PathLike[str]):
@@ -73,6 +75,11 @@ class RunDirectory:
     def last(self) -> Path:
         """The checkpoint from which the run can be resumed."""
         return self.path / self.LAST
+
+    @property
+    def grid(self) -> Path:
+        """The value and the policy of a run with method=grid."""
+        return self.path / self.GRID
 
     @property
     def figures(self) -> Path:

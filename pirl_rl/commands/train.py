@@ -19,6 +19,7 @@ from pirl_rl.assembly import make_trainer
 from pirl_rl.commands.composition import drop_leftovers, register
 from pirl_rl.commands.console import metrics_table, named_modules, override, quiet_libraries, reported
 from pirl_rl.commands.methods import check_method
+from pirl_rl.commands.solve import solve
 from pirl_rl.configuration import CONF, load_config, save_config
 from pirl_rl.continuation import restore, start_from
 from pirl_rl.errors import INTERRUPTED, ConfigError
@@ -63,6 +64,8 @@ def train_new(
         check_method(config, overrides)
         trust = [*config.trust, *named_modules(overrides), *trust]
         drop_leftovers(config, overrides, trust)
+        if config.grid is not None:
+            return solve(config, folder, overrides, trust, problem)
         trainer = make_trainer(config, folder, trust, problem)
         if config.start is not None:
             # The absolute path of the file is recorded: the typed path may be relative, or that of a run directory
@@ -85,6 +88,8 @@ def resume(folder: Path, overrides: Sequence[str]) -> None:
             if text.startswith("start="):
                 raise ConfigError(f"{text}: the run has begun already; start= is for new runs, without resume=")
             override(config, text)
+        if config.get("grid") is not None:
+            raise ConfigError(f"resume: expected a run that was trained, but {folder} holds the solution of a grid")
         trainer = make_trainer(config, folder, [*config.trust, *named_modules(overrides)])
         restore(trainer)
         save_config(config, folder)
@@ -104,7 +109,7 @@ def _train(trainer: Trainer) -> dict[str, float]:
 
 @contextlib.contextmanager
 def _new(folder: Path) -> Iterator[None]:
-    """Create a run directory. It is removed if the run ends before its first row of metrics or checkpoint.
+    """Create a run directory. It is removed if the run ends before its first row of metrics, checkpoint or grid.
 
     Raises:
         ConfigError: if the directory is not empty.
@@ -118,7 +123,7 @@ def _new(folder: Path) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        if not run.metrics.exists() and not run.checkpoints.exists():
+        if not any(path.exists() for path in (run.metrics, run.checkpoints, run.grid)):
             shutil.rmtree(folder)
             for parent in (folder.parent, folder.parent.parent):
                 with contextlib.suppress(OSError):

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
 import numpy as np
 import torch
 from torch import Tensor
 
-from pirl_rl.errors import ArgumentError
+from pirl_rl.errors import ArgumentError, CheckpointError
+from pirl_rl.files import replacing
 from pirl_rl.grid.mesh import Mesh, absorbed
 from pirl_rl.problem import ReachAvoidProblem
 
@@ -44,6 +49,92 @@ class GridSolution:
         self.problem, self.mesh, self.coarse = problem, mesh, coarse
         self._values, self._policy, self._controls, self._nearest = values, policy, controls, nearest
 
+    dtype, device = torch.float64, torch.device("cpu")
+    """The kind of tensors that evaluators pass in, as they do for `pirl_rl.solution.Solution`."""
+
+    def save(self, path: Path) -> None:
+        """Write the solution, without its problem, to one file of numpy arrays.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        with replacing(path, binary=True) as file:
+            np.savez_compressed(file, allow_pickle=False, **self._arrays())
+
+    @classmethod
+    def load(cls, path: Path, problem: ReachAvoidProblem) -> GridSolution:
+        """Read the solution of a problem from a file that `save` wrote.
+
+        Raises:
+            CheckpointError: the file is missing or broken, or belongs to a problem with other sizes.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = dict(file)
+            solution = cls._of(problem, arrays, "")
+            solution.coarse = cls._of(problem, arrays, "coarse_") if "coarse_values" in arrays else None
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise CheckpointError(f"{path}: expected the values of a grid, got {error}") from error
+        sizes = len(solution.mesh.shape), solution._controls.shape[-1]
+        if sizes != (problem.states.dim, problem.controls.dim):
+            raise CheckpointError(
+                f"{path}: expected {problem.states.dim} states and {problem.controls.dim} controls, "
+                f"got {sizes[0]} and {sizes[1]}"
+            )
+        return solution
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        mesh = self.mesh
+        arrays = {
+            "low": mesh.low,
+            "spacing": mesh.spacing,
+            "shape": np.array(mesh.shape),
+            "periodic": np.array(mesh.periodic, int),
+            "values": self._values,
+            "policy": self._policy,
+            "controls": self._controls,
+            "nearest": self._nearest,
+        }
+        coarse = {} if self.coarse is None else self.coarse._arrays()
+        return arrays | {f"coarse_{name}": array for name, array in coarse.items()}
+
+    @classmethod
+    def _of(cls, problem: ReachAvoidProblem, arrays: Mapping[str, np.ndarray], prefix: str) -> GridSolution:
+        low, spacing, shape, periodic = (arrays[prefix + name] for name in ("low", "spacing", "shape", "periodic"))
+        values, policy, controls, nearest = (
+            arrays[prefix + name] for name in ("values", "policy", "controls", "nearest")
+        )
+        mesh = Mesh(low, spacing, shape.tolist(), periodic.tolist())
+        return cls(problem, mesh, values, policy, controls, nearest)
+
+    def raw_value(self, tau: Tensor, x: Tensor) -> Tensor:
+        """V (P,) as `value` gives it; a grid has no other."""
+        return self.value(tau, x)
+
+    def gradient(self, tau: Tensor, x: Tensor) -> Tensor:
+        """The gradient of V in x (P, n), per unit of the state, by differences over half a node distance on each side.
+
+        Raises:
+            ArgumentError: a tau is outside [0, horizon].
+        """
+        steps = torch.diag(torch.as_tensor(self.mesh.spacing, dtype=x.dtype, device=x.device)) / 2
+        wrap = self.problem.states.wrap
+        slopes = [
+            (self._between(tau, wrap(x + step)) - self._between(tau, wrap(x - step))) / (2 * step.sum())
+            for step in steps
+        ]
+        return torch.stack(slopes, -1)
+
+    def residual(self, tau: Tensor, x: Tensor) -> Tensor:
+        """A grid has no residual between its nodes.
+
+        Raises:
+            ArgumentError: always.
+        """
+        raise ArgumentError(
+            "residual: a grid has none between its nodes; its error is that of `solution.error(tau, x)`"
+        )
+
     def value(self, tau: Tensor, x: Tensor) -> Tensor:
         """V (P,) in [0, 1]: 1 in A, 0 in B and in unreachable states.
 
@@ -55,11 +146,7 @@ class GridSolution:
             ArgumentError: a tau is outside [0, horizon].
         """
         x = self.problem.states.wrap(x)
-        fine = self._interpolated(tau, x)
-        value = fine
-        if self.coarse is not None:
-            extrapolated = 2 * fine - self.coarse._interpolated(tau, x)
-            value = torch.where(self.coarse._uncut(x), extrapolated, fine)
+        value = self._between(tau, x)
         lost = self.problem.failed(x) | self.problem.unreachable(x)
         return value.clamp(0, 1).masked_fill(self.problem.reached(x), 1.0).masked_fill(lost, 0.0)
 
@@ -91,13 +178,20 @@ class GridSolution:
 
     @property
     def largest_error(self) -> float:
-        """The largest `error` at tau = horizon over the nodes within `problem.states`.
+        """The largest `error` at tau = horizon over the nodes within `problem.states` and outside A and B.
 
         It is taken at the horizon, since V jumps at tau = 0 on the faces, where no mesh has a small error.
         """
         x = torch.from_numpy(self.mesh.states(self.mesh.indices()))
-        x = x[self.problem.states.contains(x)]
+        x = x[self.problem.states.contains(x) & self.problem.interior(x)]
         return float(self.error(torch.full((len(x),), self.problem.horizon, dtype=x.dtype), x).max())
+
+    def _between(self, tau: Tensor, x: Tensor) -> Tensor:
+        """V (P,) between the nodes, extrapolated where no face is near, and continued into A and B."""
+        fine = self._interpolated(tau, x)
+        if self.coarse is None:
+            return fine
+        return torch.where(self.coarse._uncut(x), 2 * fine - self.coarse._interpolated(tau, x), fine)
 
     def _interpolated(self, tau: Tensor, x: Tensor) -> Tensor:
         """V (P,) between the nodes, continued into A and B."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from pirl_rl import checkpoint
+from pirl_rl.ascent import ascend, value_ahead
 from pirl_rl.assembly import make_networks, make_problem, make_simulator
 from pirl_rl.checkpoint import check_module
 from pirl_rl.configuration import load_config
@@ -19,6 +20,7 @@ from pirl_rl.continuation import fitting
 from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.monte_carlo import Estimate, monte_carlo
 from pirl_rl.evaluation.trajectories import Trajectories, closed_loop
+from pirl_rl.grid import GridSolution
 from pirl_rl.networks import stack
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.run_directory import RunDirectory
@@ -38,7 +40,7 @@ class Run:
     (*), with 0 <= tau <= horizon.
 
     Attributes:
-        solution: the problem and the networks, in torch.
+        solution: the problem and the networks, in torch; the run of a grid has a `GridSolution`.
         config: the run's configuration.
         update: number of updates after which the networks were saved.
         simulator: the simulator of the run's training environment.
@@ -68,9 +70,33 @@ class Run:
         """The HJB residual L^pi V (*) in 1/s of the networks under the learned policy, Eq. (linear_pde)."""
         return self._call(self.solution.residual, tau, x)
 
-    def policy(self, tau, x):
-        """The learned control (*, m) in SI units."""
-        return self._call(self.solution.policy, tau, x)
+    def policy(self, tau, x, lookahead: int = 0, levels: int = 5):
+        """The control (*, m) in SI units: that of the actor, or one that looks ahead through the model.
+
+        Args:
+            tau: times to go in s, a number or (*).
+            x: states (*, n) in SI units.
+            lookahead: a number of control steps of the training, over which candidate controls are held without noise.
+                The control with the largest V at their end is taken, see `pirl_rl.ascent`; with 0, the actor's is.
+            levels: each coordinate of the control has this many candidates, evenly spaced over its range.
+        """
+        if not (isinstance(lookahead, int) and lookahead >= 0 and isinstance(levels, int) and levels >= 2):
+            raise ArgumentError(
+                f"policy: expected integers lookahead >= 0 and levels >= 2, got {lookahead!r} and {levels!r}"
+            )
+
+        if lookahead and isinstance(self.solution, GridSolution):
+            raise ArgumentError(
+                "policy: expected lookahead=0 for a grid, whose policy is already the best of its candidates"
+            )
+
+        def ahead(times: Tensor, state: Tensor) -> Tensor:
+            controls, marks = self.problem.controls, torch.linspace(-1, 1, levels, device=state.device).to(state.dtype)
+            start = controls.normalize(self.solution.policy(times, state))
+            objective = value_ahead(self.solution, self.simulator, times, state, lookahead)
+            return controls.denormalize(ascend(objective, start, marks)[0])
+
+        return self._call(ahead if lookahead else self.solution.policy, tau, x)
 
     def reach_avoid_set(self, p: float, tau: float) -> Callable:
         """The set {x : V(tau, x) > p}, Eq. (ra_levelset), as a function that maps states (*, n) to (*) bool."""
@@ -196,6 +222,10 @@ def load_run(
     run = RunDirectory(folder)
     config = load_config(folder)
     config.device = device
+    if config.get("grid") is not None:
+        problem = make_problem(config, trust) if problem is None else problem
+        # It has the methods of a solution that a run needs.
+        return Run(cast(Solution, GridSolution.load(run.grid, problem)), config, 0)
     path = run.newest() if weights is None else run.checkpoint(weights)
     state = checkpoint.load(path)
     problem = make_problem(config, trust) if problem is None else problem

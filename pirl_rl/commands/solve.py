@@ -1,0 +1,79 @@
+"""Solve a problem on a grid, `python -m pirl_rl.train +experiment=zermelo method=grid`, in place of a training."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from pirl_rl.assembly import (
+    choose_time_steps,
+    make_evaluation_simulator,
+    make_evaluators,
+    make_grid_solver,
+    make_problem,
+)
+from pirl_rl.commands.console import metrics_table
+from pirl_rl.configuration import save_config
+from pirl_rl.evaluation import evaluate, meanings_of, metrics_of
+from pirl_rl.figures import draw_run
+from pirl_rl.files import replacing
+from pirl_rl.problem import ReachAvoidProblem, check_problem
+from pirl_rl.run_directory import RunDirectory
+
+MEANINGS = {
+    "wall_seconds": "The time of the solution, in s.",
+    "grid_nodes": "The number of nodes of the mesh.",
+    "grid_error": "The largest difference at tau = T from the solution with half as many points and steps.",
+}
+
+
+def solve(
+    config: DictConfig,
+    folder: Path,
+    overrides: Sequence[str],
+    trust: Sequence[str] = (),
+    problem: ReachAvoidProblem | None = None,
+) -> dict[str, float]:
+    """Solve the problem of a configuration, and leave a run directory; returns the summary.
+
+    Args:
+        config: the configuration, with the node `grid`.
+        folder: the run directory, which exists.
+        overrides: the overrides of the user, which are recorded.
+        trust: modules outside the package that the configuration may name.
+        problem: replaces `env.problem`.
+
+    Raises:
+        PirlError: if the configuration cannot be built, or the problem does not suit a grid.
+    """
+    run = RunDirectory(folder)
+    problem = make_problem(config, trust) if problem is None else problem
+    solver = make_grid_solver(config, problem, trust)
+    check_problem(problem)
+    choose_time_steps(config, problem)
+    print(f"solving on a grid of {' x '.join(map(str, solver.points))} nodes across the box of states", flush=True)
+    started = time.perf_counter()
+    # Evaluators and figures take what has the methods of a solution.
+    solution: Any = solver.solve()
+    seconds = time.perf_counter() - started
+    save_config(config, folder)
+    OmegaConf.save(overrides, run.overrides)
+    solution.save(run.grid)
+    evaluators = make_evaluators(config.evaluation, "final", trust)
+    evidence = evaluate(solution, make_evaluation_simulator(config, problem), evaluators)
+    error = {"grid_error": solution.largest_error} if solver.estimate else {}
+    summary = {"wall_seconds": seconds, "grid_nodes": float(np.prod(solution.mesh.shape)), **error}
+    summary |= metrics_of(evidence)
+    with replacing(run.summary) as file:
+        file.write(json.dumps(summary, indent=2) + "\n")
+    print(metrics_table(summary, MEANINGS | meanings_of(evaluators, problem)))
+    for figure in draw_run(solution, run.metrics, run.figures, evidence):
+        print(f"figure   {figure}")
+    print(f"run      {run}")
+    return summary
