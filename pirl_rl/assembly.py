@@ -17,6 +17,7 @@ from pirl_rl.curriculum import Stage
 from pirl_rl.envs import ReachAvoidEnv
 from pirl_rl.errors import ConfigError
 from pirl_rl.evaluation import Evaluator
+from pirl_rl.grid import GridSolver
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.problem import ReachAvoidProblem, check_problem
 from pirl_rl.simulator import Simulator
@@ -94,7 +95,8 @@ def make_trainer(
     torch.manual_seed(networks)
     problem = make_problem(config, trust) if problem is None else problem
     choose_time_steps(config, problem)
-    env: ReachAvoidEnv = build(_without_problem(config), "env", trust, problem=problem, seed=physics, device=device)
+    supplied = {"problem": problem, "seed": physics, "device": device, "compile_simulator": config.compile}
+    env: ReachAvoidEnv = build(_without_problem(config), "env", trust, **supplied)
     parts = {"problem": problem, "simulator": env.simulator}
     actor, critics = make_networks(config, problem, trust)
     with warnings.catch_warnings():
@@ -102,7 +104,8 @@ def make_trainer(
         warnings.filterwarnings("ignore", message="No target network updater")
         # The networks were moved to their device before, so that the loss shares their buffers.
         loss = build(config.loss, "loss", trust, parts, problem=problem, actor=actor, critics=critics).to(device)
-    actor, learned = loss.actor_network.module, parts | {"solution": loss.solution()}
+    actor = loss.actor_network.module
+    learned = parts | {"solution": loss.solution(), "others": env.initial_states, "compile": config.compile}
     return build(
         config.trainer,
         "trainer",
@@ -153,6 +156,11 @@ def _without_problem(config: DictConfig) -> DictConfig:
 def _make_stage(node: DictConfig, key: str, trust: Sequence[str], parts: Mapping[str, Any]) -> Stage:
     stage = OmegaConf.create({"_target_": f"{Stage.__module__}.{Stage.__qualname__}", **node})
     return build(stage, key, trust, parts)
+
+
+def make_grid_solver(config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[str] = ()) -> GridSolver:
+    """The grid solver of a configuration with method=grid."""
+    return build(config.grid, "grid", trust, problem=problem)
 
 
 def make_evaluation_simulator(config: DictConfig, problem: ReachAvoidProblem) -> Simulator:

@@ -6,7 +6,7 @@ Parameters and buffers may have leading axes, over which `forward` broadcasts.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -59,6 +59,30 @@ class RootTime(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return torch.cat([x, torch.sqrt(x[..., :1] + self.tau_0)], -1)
+
+
+class Levels(nn.Module):
+    """Appends the k levels of the constraints of A and B to inputs (*, d) that start with (tau, x).
+
+    V changes fastest across the faces of the sets and in layers along them. As functions of the levels these layers are
+    functions of one input, which a small network can represent for faces of any shape.
+
+    Args:
+        levels: maps states (*, n) to the levels (*, k).
+        states: the number n of states.
+    """
+
+    def __init__(self, levels: Callable[[Tensor], Tensor], states: int):
+        super().__init__()
+        self.levels, self.states = levels, states
+
+    def of(self, x: Tensor) -> Tensor:
+        """The states (*, n) in inputs (*, d)."""
+        # A view of the inputs cannot be differentiated twice in forward mode by compiled code.
+        return x[..., 1 : 1 + self.states].clone()
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.cat([x, self.levels(self.of(x))], -1)
 
 
 class Periodic(nn.Module):

@@ -27,7 +27,9 @@ from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.schedules import WEIGHTS
 from pirl_rl.solution import Solution
 
-TD_CRITERIA = {"squares": nn.functional.mse_loss, "cross_entropy": nn.functional.binary_cross_entropy}
+TD_CRITERIA = ("squares", "cross_entropy")
+
+_cross_entropy = nn.functional.binary_cross_entropy_with_logits
 
 
 class PIRLLoss(ScheduledTD3Loss):
@@ -222,9 +224,15 @@ class PIRLLoss(ScheduledTD3Loss):
                 values = critic(tau, x, action)
                 value = values.amin(0) if self.target_critics == "min" else values.mean(0)
             target = replay["next", "reward"] + (~replay["next", "terminated"]) * value
+        inputs = replay["tau"], replay["state"], replay["action"]
         with self._critics() as critic:
-            value = critic(replay["tau"], replay["state"], replay["action"])
-        error = TD_CRITERIA[self.td_criterion](value, target.expand_as(value), reduction="none")
+            if self.td_criterion == "squares":
+                error = (critic(*inputs) - target).square()
+            else:
+                # Targets may lie outside [0, 1] by a control variate. The loss is linear in them, so that their mean
+                # counts, and from the logits it has a gradient where the output is rounded to 0 or 1.
+                logits = critic.logits(*inputs)
+                error = _cross_entropy(logits, target.expand_as(logits), reduction="none")
         return error.squeeze(-1).sum(0).mean()
 
     def _hjb_loss(self, points: TensorDictBase) -> Tensor:

@@ -10,18 +10,22 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from functools import partial
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from pirl_rl.errors import ArgumentError
-from pirl_rl.layers import Dense, Periodic, RootTime, Scaling
+from pirl_rl.layers import Dense, Levels, Periodic, RootTime, Scaling
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sets import Box
 
 ROOT_TIME_OFFSET = 1e-4
 """tau_0 of `RootTime` as a fraction of the horizon."""
+
+LEVEL_POINTS = 4_096
+"""The number of states at which the levels of the sets are taken to scale them."""
 
 
 def _stack(
@@ -33,10 +37,15 @@ def _stack(
     output: str | None,
     root_time: bool,
     scaling: Box | None,
+    levels: bool,
 ) -> nn.Sequential:
     box = _with_periods(scaling or problem.states, problem.states)
     low, high = (0.0, *box.low, *[-1.0] * controls), (problem.horizon, *box.high, *[1.0] * controls)
     layers: list[nn.Module] = []
+    if levels:
+        layer, middle, width = _levels(problem)
+        layers.append(layer)
+        low, high = (*low, *(middle - width).tolist()), (*high, *(middle + width).tolist())
     if root_time:
         tau_0 = ROOT_TIME_OFFSET * problem.horizon
         layers.append(RootTime(tau_0))
@@ -51,6 +60,23 @@ def _stack(
         layers += [Dense(width, wide), _activation("activation", activation)]
         width = wide
     return nn.Sequential(*layers, Dense(width, outputs), *([] if output is None else [_activation("output", output)]))
+
+
+def _constraints(problem: ReachAvoidProblem, kept: Sequence[int] | None, x: Tensor) -> Tensor:
+    """The levels (*, k) of the constraints of A and B at states (*, n); of all, or of those with the numbers `kept`."""
+    sets = [problem.reached_constraints(x)] if problem.objective == "reach-avoid" else []
+    both = torch.cat(sets + ([problem.avoid_constraints(x)] if problem.has_avoid_set else []), -1)
+    return both if kept is None else both[..., kept]
+
+
+def _levels(problem: ReachAvoidProblem) -> tuple[Levels, Tensor, Tensor]:
+    """The layer of the levels of A and B, with their means (k,) and standard deviations (k,) over the box of states."""
+    x = problem.states.sample(LEVEL_POINTS, torch.Generator().manual_seed(0), torch.float64)
+    sampled = _constraints(problem, None, x)
+    middle, width = sampled.mean(0), sampled.std(0)
+    # A level that is constant or infinite says nothing.
+    kept = ((width > 0) & width.isfinite()).nonzero().flatten().tolist()
+    return Levels(partial(_constraints, problem, kept), problem.states.dim), middle[kept], width[kept]
 
 
 def _with_periods(box: Box, states: Box) -> Box:
@@ -80,7 +106,7 @@ def _xavier(layers: nn.Sequential) -> None:
             nn.init.zeros_(layer.bias)
 
 
-def _spread(layers: nn.Sequential, spread: float | None) -> None:
+def _spread(layers: nn.Sequential, spread: float | None, problem: ReachAvoidProblem, controls: int) -> None:
     """Spread the zeros of the first hidden layer over the box of the inputs; nothing happens without a spread.
 
     By the usual initialisation all zeros pass near the middle of the box, and training has to move them first. In few
@@ -93,14 +119,14 @@ def _spread(layers: nn.Sequential, spread: float | None) -> None:
         return
     if not spread > 0:
         raise ArgumentError(f"spread: expected a number > 0, or None, got {spread}")
-    scaling = next(index for index, layer in enumerate(layers) if isinstance(layer, Scaling))
     first = next(index for index, layer in enumerate(layers) if isinstance(layer, Dense))
     dense: Dense = layers[first]  # type: ignore[assignment]
-    corners = 2 * torch.rand(dense.out_features, len(layers[scaling].scale)) - 1  # type: ignore[arg-type]
-    through = layers[scaling + 1 : first](corners)
+    count, slope = dense.out_features, spread * (3 / (problem.states.dim + 1)) ** 0.5
+    tau, action = problem.horizon * torch.rand(count, 1), 2 * torch.rand(count, controls) - 1
     with torch.no_grad():
+        through = layers[:first](torch.cat([tau, problem.states.sample(count), action], -1))
         direction = nn.functional.normalize(torch.randn_like(dense.weight), dim=-1)
-        dense.weight.copy_(2 * spread * torch.rand(dense.out_features, 1) * direction)
+        dense.weight.copy_(2 * slope * torch.rand(count, 1) * direction)
         dense.bias.copy_(-(dense.weight * through).sum(-1))
 
 
@@ -114,9 +140,11 @@ class Actor(nn.Module):
         scaling: box of states that the first layer maps to [-1, 1]^n; default `problem.states`, which gives the periods
             of periodic axes in any case.
         root_time: whether sqrt(tau) is an input beside tau, see `RootTime`.
-        spread: the mean slope of the neurons of the first layer in the scaled inputs. Their zeros then pass through
-            points that are uniform in the box. None takes the usual initialisation, for which all zeros pass near the
-            middle of the box.
+        spread: the mean slope of the neurons of the first layer in the scaled inputs, for two states. For n states it
+            is sqrt(3/(n + 1)) times that, so that V does not vary faster over the box of more dimensions. Their zeros
+            then pass through points that are uniform in the box. None takes the usual initialisation, for which
+            all zeros pass near the middle of the box.
+        levels: whether the levels of the constraints of A and B are inputs too, see `Levels`.
 
     Raises:
         ArgumentError: `activation` is not the name of a layer of `torch.nn`, or `spread` is not positive.
@@ -130,10 +158,11 @@ class Actor(nn.Module):
         scaling: Box | None = None,
         root_time: bool = False,
         spread: float | None = None,
+        levels: bool = False,
     ):
         super().__init__()
-        self.layers = _stack(problem, 0, hidden, problem.controls.dim, activation, "Tanh", root_time, scaling)
-        _spread(self.layers, spread)
+        self.layers = _stack(problem, 0, hidden, problem.controls.dim, activation, "Tanh", root_time, scaling, levels)
+        _spread(self.layers, spread, problem, 0)
 
     def logits(self, tau: Tensor, state: Tensor) -> Tensor:
         """The output (N, m) before the hyperbolic tangent of the last layer."""
@@ -157,9 +186,11 @@ class Critic(nn.Module):
             infinite weights. None is a linear output, which attains both.
         scaling: box of states that the first layer maps to [-1, 1]^n; default `problem.states`, which gives the periods
             of periodic axes in any case.
-        spread: the mean slope of the neurons of the first layer in the scaled inputs. Their zeros then pass through
-            points that are uniform in the box. None takes the usual initialisation, for which all zeros pass near the
-            middle of the box.
+        spread: the mean slope of the neurons of the first layer in the scaled inputs, for two states. For n states it
+            is sqrt(3/(n + 1)) times that, so that V does not vary faster over the box of more dimensions. Their zeros
+            then pass through points that are uniform in the box. None takes the usual initialisation, for which
+            all zeros pass near the middle of the box.
+        levels: whether the levels of the constraints of A and B are inputs too, see `Levels`.
 
     Raises:
         ArgumentError: `activation` or `output` is not the name of a layer of `torch.nn`, or `spread` is not positive.
@@ -175,17 +206,22 @@ class Critic(nn.Module):
         output: Literal["Sigmoid"] | None = None,
         scaling: Box | None = None,
         spread: float | None = None,
+        levels: bool = False,
     ):
         super().__init__()
         self.action_input = action_input
         controls = problem.controls.dim if action_input else 0
-        self.layers = _stack(problem, controls, hidden, 1, activation, output, root_time, scaling)
+        self.layers = _stack(problem, controls, hidden, 1, activation, output, root_time, scaling, levels)
         _xavier(self.layers)
-        _spread(self.layers, spread)
+        _spread(self.layers, spread, problem, controls)
 
     def inputs(self, tau: Tensor, state: Tensor, action: Tensor) -> Tensor:
         """The input (N, d) of the first layer: (tau, x, u), or (tau, x) for a critic V(tau, x)."""
         return torch.cat([tau, state, action] if self.action_input else [tau, state], -1)
+
+    def logits(self, tau: Tensor, state: Tensor, action: Tensor) -> Tensor:
+        """The output (N, 1) before the sigmoid of the last layer, for a critic with output "Sigmoid"."""
+        return self.layers[:-1](self.inputs(tau, state, action))
 
     def forward(self, tau: Tensor, state: Tensor, action: Tensor) -> Tensor:
         return self.layers(self.inputs(tau, state, action))

@@ -7,6 +7,8 @@ activation z of a network is an Ito process dz = a dt + s dW by Ito's lemma. The
 a = (-1, f) and one column s_j = (0, sigma_j) for each of the w noise channels. The layers map (z, a, s) as follows:
 
 - an affine layer applies its weights to z, a and s, and its bias to z alone;
+- the levels g of the sets are appended as the processes of Ito's lemma, grad g . a + 1/2 sum_j s_j^T hess g s_j and
+  grad g . s, by the forward mode of `torch.func`;
 - an activation phi gives (phi(z), phi'(z) a + 1/2 phi''(z) |s|^2, phi'(z) s); so do the sine and the cosine of a
   periodic coordinate.
 
@@ -23,7 +25,7 @@ import torch
 from torch import Tensor, nn
 
 from pirl_rl.errors import ArgumentError
-from pirl_rl.layers import Dense, Periodic, RootTime, Scaling
+from pirl_rl.layers import Dense, Levels, Periodic, RootTime, Scaling
 from pirl_rl.networks import CriticValue
 from pirl_rl.problem import ReachAvoidProblem
 
@@ -109,6 +111,9 @@ def _propagate(layer: nn.Module, z: Tensor, a: Tensor, s: Tensor) -> tuple[Tenso
         root = layer(z)
         rate = 1 / (2 * root[..., -1:])
         return root, torch.cat([a, a[..., :1] * rate], -1), nn.functional.pad(s, (0, 1))
+    if isinstance(layer, Levels):
+        rate, kicks = _along_levels(layer.levels, *(layer.of(entry) for entry in (z, a, s)))
+        return layer(z), torch.cat([a, rate], -1), torch.cat([s, kicks], -1)
     if isinstance(layer, Scaling):
         return layer(z), a * layer.scale.unsqueeze(-2), s * layer.scale[..., None, None, :]
     if isinstance(layer, Dense):
@@ -121,6 +126,20 @@ def _propagate(layer: nn.Module, z: Tensor, a: Tensor, s: Tensor) -> tuple[Tenso
     else:
         y, slope, curvature = ACTIVATIONS[type(layer)](z)
     return y, slope * a + curvature * s.square().sum(-3) / 2, slope.unsqueeze(-3) * s
+
+
+def _along_levels(levels: Callable[[Tensor], Tensor], x: Tensor, f: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
+    """The drift (N, k) and the columns (w, N, k) of levels at x (N, n), along f (N, n) and sigma (w, N, n)."""
+
+    def along(function: Callable[[Tensor], Tensor], tangent: Tensor) -> Callable[[Tensor], Tensor]:
+        return lambda y: torch.func.jvp(function, (y,), (tangent,))[1]
+
+    rate, kicks = along(levels, f)(x), []
+    for column in sigma.unbind(0):
+        kick = along(levels, column)
+        kicks.append(kick(x))
+        rate = rate + along(kick, column)(x) / 2
+    return rate, torch.stack(kicks) if kicks else rate.new_zeros((0, *rate.shape))
 
 
 def _forward_mode(value: ValueFunction, tau: Tensor, x: Tensor, f: Tensor, sigma: Tensor) -> Tensor:
@@ -141,7 +160,7 @@ def require_twice_differentiable(layers: nn.Sequential) -> None:
         ArgumentError: an activation is not one of `ACTIVATIONS`.
     """
     for layer in layers:
-        if not isinstance(layer, (RootTime, Scaling, Periodic, Dense)) and type(layer) not in ACTIVATIONS:
+        if not isinstance(layer, (Levels, RootTime, Scaling, Periodic, Dense)) and type(layer) not in ACTIVATIONS:
             known = ", ".join(sorted(kind.__name__ for kind in ACTIVATIONS))
             raise ArgumentError(
                 f"critic: the HJB residual takes second derivatives, so every activation must be C^2; "

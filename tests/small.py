@@ -19,7 +19,9 @@ from pirl_rl.continuation import restore
 from pirl_rl.simulator import Simulator
 from pirl_rl.trainer import Trainer
 
-QUICK = ("+experiment=reach1d", "+debug=default", "evaluation.final=[exact]", "evaluation.during=[exact]")
+# The tests below write the configuration before a trainer chooses the time steps.
+STEPS = ("env.dt=0.1", "env.substeps=1")
+QUICK = ("+experiment=reach1d", "+debug=default", *STEPS, "evaluation.final=[exact]", "evaluation.during=[exact]")
 # A buffer that wraps around, and events that fall on different updates.
 EVENTS = (
     *("env.num_envs=64", "collector.frames_per_batch=128", "collector.updates_per_batch=3", "collector.n_steps=1"),
@@ -27,7 +29,11 @@ EVENTS = (
     *("trainer.log_every=3", "trainer.evaluate_every=4", "trainer.checkpoint_every=5"),
 )
 
-TUNED = ("+experiment=reach1d", "+debug=default", "env.num_envs=32", "collector.frames_per_batch=64")
+# The terms of the physics, two critics and an actor that ascends the Hamiltonian, with the constructors' sizes.
+PHYSICS = ("recipe=plain", "pirl.final=[1,1,10]", "pirl.critics=2", "pirl.td_criterion=squares", "pirl.stages=[]")
+PHYSICS += ("pirl.target_critics=min", "pirl.actor_rule._target_=pirl_rl.actor_rules.Hamiltonian")
+
+TUNED = ("+experiment=reach1d", "+debug=default", *STEPS, "env.num_envs=32", "collector.frames_per_batch=64")
 TUNED += ("collector.warmup_frames=64",)
 DRIFT = ("+experiment=drift", "+debug=drift", "evaluation.during=[]", "evaluation.final=[]")
 

@@ -12,10 +12,11 @@ from torch import Tensor
 from pirl_rl.collectors import ControlVariate
 from pirl_rl.collectors.transitions import Exploration, Transitions, exploring_policy
 from pirl_rl.envs import ReachAvoidEnv
-from pirl_rl.errors import Interrupted
+from pirl_rl.errors import ArgumentError, Interrupted
 from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.problems import Reach1D
 from pirl_rl.sampling.initial_states import UniformStates
+from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
 CONTROL_VARIATE = "+collector.control_variate={_target_: pirl_rl.collectors.ControlVariate}"
@@ -84,10 +85,16 @@ def test_the_policy_notes_the_slope_of_the_mean_of_the_critics():
     problem = Reach1D()
     torch.manual_seed(0)
     solution = Solution(problem, Actor(problem), stack([Critic(problem) for _ in range(2)]))
-    policy = exploring_policy(solution.actor, Exploration(0.0, "always"), ControlVariate(solution))
     tau, x = torch.rand(7, 1), torch.randn(7, 1)
-    played = policy(TensorDict({"tau": tau, "state": x, "is_init": torch.ones(7, 1, dtype=torch.bool)}, [7]))
-    assert torch.allclose(played["slope"], solution.gradient(tau.squeeze(-1), x), atol=1e-6)
+    slope = solution.gradient(tau.squeeze(-1), x)
+    # sigma is 1 and dt 0.04: the deviation of V in a step is a fifth of its slope.
+    for limit in (10.0, 0.2 * slope.abs().median().item()):
+        variate = ControlVariate(solution, Simulator(problem, 0.04), compile=False, limit=limit)
+        policy = exploring_policy(solution.actor, Exploration(0.0, "always"), variate)
+        played = policy(TensorDict({"tau": tau, "state": x, "is_init": torch.ones(7, 1, dtype=torch.bool)}, [7]))
+        shortened = slope.clamp(-limit / 0.2, limit / 0.2)
+        assert torch.allclose(played["slope"], shortened, atol=1e-6)
+    assert (shortened != slope).sum() == 3
 
 
 def test_training_follows_the_critics_and_resumes_bit_for_bit(tmp_path):
@@ -119,3 +126,10 @@ def test_workers_take_the_noise_out_too(tmp_path):
 def test_a_control_variate_needs_a_solution():
     with pytest.raises(TypeError):
         ControlVariate()  # type: ignore[call-arg]
+
+
+def test_a_limit_is_positive():
+    problem = Reach1D()
+    solution = Solution(problem, Actor(problem), stack([Critic(problem)]))
+    with pytest.raises(ArgumentError, match=r"control_variate\.limit: expected a number > 0, got 0"):
+        ControlVariate(solution, Simulator(problem), compile=False, limit=0)

@@ -9,7 +9,7 @@ import torch
 from small import assert_same, at_update, interrupt, resumed, small_trainer
 
 from pirl_rl import checkpoint
-from pirl_rl.actor_rules import ClippedSurrogate, Hamiltonian, LookAhead
+from pirl_rl.actor_rules import BestControl, ClippedSurrogate, LookAhead
 from pirl_rl.curriculum import Curriculum, Stage
 from pirl_rl.errors import ConfigError, Interrupted
 from pirl_rl.loggers import read_metrics
@@ -83,7 +83,7 @@ def test_the_trainer_takes_over_what_a_stage_sets(tmp_path):
     step = trainer.collector.step
 
     def watch(k):
-        law = trainer.collector.initial_states.box
+        law = getattr(trainer.collector.initial_states, "box", None)
         rates = trainer.collector.n_steps, trainer.learner.actor_every, type(trainer.learner.loss.actor_rule)
         seen.append((law and law.low, trainer.batches.collocation.size, *rates))
         step(k)
@@ -91,7 +91,7 @@ def test_the_trainer_takes_over_what_a_stage_sets(tmp_path):
     trainer.collector.step = watch
     trainer.train()
     size = small_trainer(tmp_path / "other", *STAGES).batches.collocation.size
-    assert seen == [((0.0,), size, 1, 2, Hamiltonian)] * 5 + [(None, 7, 3, 5, LookAhead)] * 5
+    assert seen == [((0.0,), size, 1, 2, BestControl)] * 5 + [(None, 7, 3, 5, LookAhead)] * 5
 
 
 POLICY = (
@@ -128,7 +128,7 @@ def test_a_stage_of_policy_gradients_follows_its_own_noise_alone(collector, tmp_
 
     sample, trainer.batches.sample = trainer.batches.sample, watch
     trainer.train()
-    rules = [(Hamiltonian, 0.0, True)] * 3 + [(ClippedSurrogate, 0.3, True)] * 6 + [(Hamiltonian, 0.1, True)] * 3
+    rules = [(BestControl, 0.0, True)] * 3 + [(ClippedSurrogate, 0.3, True)] * 6 + [(BestControl, 0.1, True)] * 3
     assert [one[:3] for one in seen] == rules
     assert all(off == 0.0 for *_, off in seen[:3])
     assert all(0.5 < off < 2.0 for *_, off in seen[3:9])

@@ -112,7 +112,7 @@ def test_collector(tmp_path):
     """80 / 4 updates lie between two batches: beside the warm-up's, one is played before update 0 and one before 20."""
     run = run_of("my_collector", tmp_path)
     state = checkpoint.load(run / "checkpoints" / "last.pt")
-    assert state["collector"]["frames"] == 3 * 5_120
+    assert state["collector"]["frames"] == 3 * 512
 
 
 def test_advisor(tmp_path, trained):

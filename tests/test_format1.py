@@ -55,6 +55,8 @@ def test_the_whole_configuration_builds(name):
 
 def test_a_new_run_starts_from_networks_of_the_first_format(tmp_path):
     settings = {"debug": "default", "logger": "none", "evaluate_every": 0, "learner.learning_rate": 1e-6}
+    # The networks of the first format: two critics with linear outputs.
+    settings |= {"recipe": "plain", "pirl": {"critics": 2, "td_criterion": "squares"}}
     run = pirl_rl.train("reach1d", folder=tmp_path / "run", start=str(FOLDERS["reach1d"]), updates=1, **settings)
     before = pirl_rl.load_run(FOLDERS["reach1d"])
     tau, x = np.full(9, 1.0), np.linspace(-2, 1.9, 9)[:, None]

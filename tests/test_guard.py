@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from small import assert_same, at_update, interrupt, resumed, small_trainer
+from small import PHYSICS, assert_same, at_update, interrupt, resumed, small_trainer
 
 from pirl_rl.checkpoint import load
 from pirl_rl.continuation import start_from
@@ -19,6 +19,7 @@ from pirl_rl.run_directory import RunDirectory
 from pirl_rl.trainer import Trainer
 
 GUARDED = (
+    *PHYSICS,
     *("trainer.rollback=true", "evaluation.during=[success]", "evaluation.final=[success]"),
     *("evaluation.success.episodes=1000", "trainer.evaluate_every=10", "trainer.log_every=10"),
     *("trainer.checkpoint_every=25", "trainer.updates=60", "learner.decay=constant", "schedule=constant"),

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
+from oracles import name
 
 from pirl_rl.errors import ArgumentError
 from pirl_rl.layers import Dense, Scaling
 from pirl_rl.networks import Actor, Critic
-from pirl_rl.problems import DubinsCar, HalfSpace, ZermeloBoat
+from pirl_rl.problems import DubinsCar, HalfSpace, Pendulum, Reach1D, ZermeloBoat
 
 WIDTH = 512
 
@@ -26,14 +27,15 @@ def test_zeros_of_spread_neurons_pass_through_the_box(problem):
     torch.manual_seed(0)
     for network in networks(problem, root_time=True, spread=3.0):
         dense = first_dense(network)
-        slope = dense.weight.norm(dim=-1)
+        # The slope falls with the number of states, so that V does not vary faster in more dimensions.
+        slope = dense.weight.norm(dim=-1) * ((problem.states.dim + 1) / 3) ** 0.5
         # 2 * 3 * U with U uniform: the mean is 3, and its standard error 3 / sqrt(3 * 512).
-        assert slope.max() <= 6
+        assert slope.max() <= 6 + 1e-5
         assert abs(slope.mean().item() - 3) < 4 * 3 / (3 * WIDTH) ** 0.5
         # A plane meets the box [-1, 1]^d if and only if |b| <= sum |w_i|.
         assert (dense.bias.abs() <= dense.weight.abs().sum(-1)).all()
         # The distances of the planes from the middle spread over the box: U has the standard deviation 1/sqrt(3).
-        distance = dense.bias / slope
+        distance = dense.bias / dense.weight.norm(dim=-1)
         assert abs(distance.std().item() * 3**0.5 - 1) < 0.15
 
 
@@ -67,3 +69,29 @@ def test_an_actor_may_have_the_root_of_time():
     actor = Actor(ZermeloBoat(), root_time=True)
     assert first_dense(actor).in_features == 4
     assert actor(torch.rand(5, 1), torch.rand(5, 2)).shape == (5, 2)
+
+
+@pytest.mark.parametrize("problem", [Reach1D(), ZermeloBoat(), DubinsCar(), Pendulum()], ids=name)
+def test_the_levels_of_the_sets_are_inputs(problem):
+    x = problem.states.sample(20_000, torch.Generator().manual_seed(1))
+    levels = problem.avoid_constraints(x) if problem.has_avoid_set else x[:, :0]
+    if problem.objective == "reach-avoid":
+        levels = torch.cat([problem.reached_constraints(x), levels], -1)
+    critic = Critic(problem, levels=True, root_time=False)
+    scaling = next(layer for layer in critic.layers if isinstance(layer, Scaling))
+    inputs = scaling(critic.layers[0](torch.cat([torch.rand(len(x), 1), x], -1)))[:, 1 + problem.states.dim :]
+    # They are scaled to the mean 0 and the standard deviation 1 over the box.
+    torch.testing.assert_close(inputs, (levels - levels.mean(0)) / levels.std(0), atol=0.1, rtol=0.1)
+
+
+class Disabled(ZermeloBoat):
+    """Avoid constraints of which one is constant and one infinite."""
+
+    def avoid_constraints(self, x):
+        far = torch.full_like(x[..., :1], torch.inf)
+        return torch.cat([super().avoid_constraints(x), torch.ones_like(far), far], -1)
+
+
+def test_levels_that_say_nothing_are_left_out():
+    ours, other = (first_dense(Critic(problem, levels=True)) for problem in (Disabled(), ZermeloBoat()))
+    assert ours.in_features == other.in_features

@@ -208,7 +208,7 @@ def test_the_command_starts_from_a_run(first, cli, tmp_path):
         (["start=3"], "start: expected the path of a run or a checkpoint, got 3"),
         (["start=[a]"], "start: expected the path"),
         (["start=FIRST", "critic.hidden=[8]"], "does not fit the run's configuration"),
-        (["start=FIRST", "critics=1"], "does not fit the run's configuration"),
+        (["start=FIRST", "critics=2"], "does not fit the run's configuration"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

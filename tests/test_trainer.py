@@ -7,7 +7,7 @@ import math
 
 import pytest
 import torch
-from small import assert_same, at_update, interrupt, resumed, small_trainer
+from small import PHYSICS, assert_same, at_update, interrupt, resumed, small_trainer
 
 from pirl_rl.checkpoint import load
 from pirl_rl.errors import CheckpointError, DivergenceError, Interrupted
@@ -65,7 +65,7 @@ def test_rows_after_the_checkpoint_are_written_again(whole, tmp_path):
 
 
 def test_more_updates_than_first_asked_for(tmp_path):
-    constant = ("learner.decay=constant", "schedule=constant")
+    constant = ("learner.decay=constant", "schedule=constant", "pirl.stages=[]")
     long, short = tmp_path / "long", tmp_path / "short"
     small_trainer(long, *constant, "trainer.updates=20").train()
     small_trainer(short, *constant, "trainer.updates=10").train()
@@ -106,7 +106,7 @@ def batch(trainer, k: int):
 
 def test_a_term_is_left_out_while_its_weight_is_negligible(tmp_path):
     """A sigmoid of steepness 5 is 4e-6 at 2.5 updates before its center, and below 1e-6 at 3 before."""
-    trainer = small_trainer(tmp_path, "method=pirl", "schedule.center=9.5", "schedule.steepness=5")
+    trainer = small_trainer(tmp_path, *PHYSICS, "schedule.center=9.5", "schedule.steepness=5")
     trainer.collector.start()
     parts = []
     for k in range(20):
@@ -115,7 +115,7 @@ def test_a_term_is_left_out_while_its_weight_is_negligible(tmp_path):
 
 
 def test_terms_without_weight_are_left_out(tmp_path):
-    kept = {"td3": {"td_loss"}, "pinn": {"hjb_loss", "boundary_loss"}, "pirl": {"td_loss", "hjb_loss", "boundary_loss"}}
+    kept = {"td3": {"td_loss"}, "pinn": {"hjb_loss", "boundary_loss"}, "pirl": {"td_loss"}}
     for method, terms in kept.items():
         trainer = small_trainer(tmp_path / method, f"method={method}")
         trainer.collector.start()
@@ -140,7 +140,7 @@ def test_nan_stops_with_update_and_term(tmp_path):
 
 
 def test_explosion_stops_with_update_and_term(tmp_path):
-    trainer = small_trainer(tmp_path, "method=fixed")
+    trainer = small_trainer(tmp_path, *PHYSICS, "method=fixed")
     at_update(trainer, 6, lambda: scale_boundary(trainer, 1e5))
     with pytest.raises(DivergenceError, match=r"update 6: boundary_loss.*update 5 is kept"):
         trainer.train()

@@ -35,8 +35,8 @@ class MultiAsyncCollector:
         workers: the number of processes.
         frames_per_batch: transitions that a worker delivers at once, a multiple of the environment's batch size.
         updates_per_batch: updates between two copies of the actor.
-        warmup_frames, buffer_size, exploration_noise, exploration, n_steps, control_variate, seed: arguments of
-            `SyncCollector`.
+        warmup_frames, buffer_size, exploration_noise, exploration, n_steps, control_variate, initial_states, seed:
+            arguments of `SyncCollector`.
         patience: seconds without a new transition after which `CollectorError` is raised; for a worker that died it is
             raised at once.
 
@@ -57,6 +57,7 @@ class MultiAsyncCollector:
         exploration: Literal["always", "start"] = "always",
         n_steps: int = 20,
         control_variate: ControlVariate | None = None,
+        initial_states: InitialStates | None = None,
         seed: int = 0,
         patience: float = 60.0,
     ):
@@ -68,6 +69,7 @@ class MultiAsyncCollector:
         self._networks = nn.ModuleList([actor] if control_variate is None else [actor, control_variate])
         self._seed, self._exploration = seed, Exploration(exploration_noise, exploration)
         self._env, self._workers, self._random_warmup = env, workers, True
+        env.initial_states = initial_states or env.initial_states
         self._frames_per_batch, self._transitions = frames_per_batch, Transitions(n_steps)
         self._collector: Any = None
         self._weights: Any = None

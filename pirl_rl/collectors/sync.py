@@ -32,6 +32,7 @@ class SyncCollector:
         n_steps: the length of returns, in control steps; with `exploration="start"` it should be above 1.
         control_variate: takes the noise of the physics out of the returns, see `pirl_rl.collectors.transitions`; None
             leaves it in.
+        initial_states: the distribution of the initial states of episodes, in place of that of the environment.
         seed: the seed of sampling from the buffer.
 
     Raises:
@@ -50,10 +51,12 @@ class SyncCollector:
         exploration: Literal["always", "start"] = "always",
         n_steps: int = 20,
         control_variate: ControlVariate | None = None,
+        initial_states: InitialStates | None = None,
         seed: int = 0,
     ):
         check_sizes(env, frames_per_batch, updates_per_batch, warmup_frames, buffer_size)
         self.env, self.updates_per_batch, self.warmup_frames = env, updates_per_batch, warmup_frames
+        env.initial_states = initial_states or env.initial_states
         self.buffer, self._rng = make_buffer(buffer_size, env.device, seed)
         self._exploration = Exploration(exploration_noise, exploration)
         self._collector = Collector(

@@ -19,7 +19,9 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 
+from pirl_rl.compilation import Compiled
 from pirl_rl.errors import ArgumentError
+from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
 TRANSITION = ("tau", "state", "action", "loc", *(("next", key) for key in ("tau", "state", "reward", "terminated")))
@@ -57,18 +59,40 @@ class Exploration(nn.Module):
 class ControlVariate(nn.Module):
     """Notes grad V(tau, x) at each step, by which the noise of the physics is taken out of the returns.
 
+    A slope that is too steep adds noise in place of taking it out, and in many dimensions V would learn ever steeper
+    slopes from such returns. So the slope is shortened where the deviation |sigma^T grad V| sqrt(dt) of V in one step
+    exceeds a limit. The factor is known before the step, so that the means of the returns stay as they are.
+
     Args:
         solution: gives V, the mean of its critics.
+        simulator: gives sigma and the length of a control step.
+        compile: whether the slope is compiled. Where that fails, it runs eagerly after one warning.
+        limit: the largest deviation of V in one step, > 0.
+
+    Raises:
+        ArgumentError: `limit` is not positive.
     """
 
-    def __init__(self, solution: Solution):
+    def __init__(self, solution: Solution, simulator: Simulator, compile: bool, limit: float = 0.2):
         super().__init__()
-        self.critic = solution.critic
+        if not limit > 0:
+            raise ArgumentError(f"collector.control_variate.limit: expected a number > 0, got {limit}")
+        self.critic, self.simulator, self.limit, self.compile_slope = solution.critic, simulator, limit, compile
+        self._compiled: Compiled | None = None
 
     def forward(self, tau: Tensor, state: Tensor, action: Tensor) -> Tensor:
         """The slope (N, n) of V, per unit of the state, at tau (N, 1) and state (N, n), at a frozen action (N, m)."""
-        value = self.critic.at(action)
-        return torch.func.grad(lambda x: value(tau.squeeze(-1), x).mean(0).sum())(state)
+        if self.compile_slope and self._compiled is None:
+            # Not before the first call, because copies of this module are sent to other processes.
+            self._compiled = Compiled(self._slope, "the control variate")
+        return (self._compiled or self._slope)(tau, state, action)
+
+    def _slope(self, tau: Tensor, state: Tensor, action: Tensor) -> Tensor:
+        value, problem = self.critic.at(action), self.simulator.problem
+        slope = torch.func.grad(lambda x: value(tau.squeeze(-1), x).mean(0).sum())(state)
+        sigma = problem.diffusion(state, problem.controls.denormalize(action))
+        deviation = (slope.unsqueeze(-1) * sigma).sum(-2).norm(dim=-1, keepdim=True) * self.simulator.dt**0.5
+        return slope * (self.limit / deviation.clamp(min=self.limit))
 
 
 def exploring_policy(

@@ -24,8 +24,31 @@ REFERENCE = re.compile(r"^\s*- /arguments/([\w.]+)@", re.MULTILINE)
 
 SUPPLIED = frozenset(
     [
-        *("problem", "simulator", "env", "actor", "critics", "loss", "learner", "collector", "collocation", "boundary"),
-        *("schedule", "stages", "during", "final", "logger", "folder", "config", "device"),
+        *(
+            "problem",
+            "simulator",
+            "solution",
+            "env",
+            "actor",
+            "critics",
+            "loss",
+            "learner",
+            "collector",
+            "collocation",
+            "boundary",
+        ),
+        *(
+            "schedule",
+            "stages",
+            "during",
+            "final",
+            "logger",
+            "folder",
+            "config",
+            "device",
+            "compile",
+            "compile_simulator",
+        ),
         *("td_weight", "hjb_weight", "boundary_weight"),
     ]
 )

@@ -61,7 +61,7 @@ def _settings(path: Path) -> dict[str, Any]:
     """The entries of a method's file, merged over those of the files in its defaults list."""
     own = OmegaConf.load(path)
     assert isinstance(own, DictConfig)
-    bases = [name for name in own.get("defaults", []) if name != "_self_"]
+    bases = [name for name in own.get("defaults", []) if isinstance(name, str) and "/" not in name and name != "_self_"]
     merged = OmegaConf.merge(*(OmegaConf.create(_settings(path.with_stem(name))) for name in bases), own)
     return OmegaConf.to_container(merged, resolve=False)  # type: ignore[return-value]
 

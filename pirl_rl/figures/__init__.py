@@ -9,6 +9,7 @@ from pirl_rl.figures.files import DPI, FIGURES, save_figures
 from pirl_rl.figures.rollouts import draw_rollouts
 from pirl_rl.figures.run import draw_run
 from pirl_rl.figures.slices import draw_slices
+from pirl_rl.figures.suite import draw_suite
 
 __all__ = [
     "DPI",
@@ -19,5 +20,6 @@ __all__ = [
     "draw_rollouts",
     "draw_run",
     "draw_slices",
+    "draw_suite",
     "save_figures",
 ]

@@ -1,0 +1,59 @@
+"""What each part of the default recipe gives: the suite's problems without that part, or with another one.
+
+python benchmarks/recipe.py [out=runs/recipe] [problems=zermelo,pendulum] [seeds=0,1] [only=default,no levels]
+
+Each variant is a run of `python -m pirl_rl.suite` with other settings; a benchmark that was stopped goes on.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+from pirl_rl.commands.suite import main as suite
+
+STATES = "collector.initial_states"
+
+VARIANTS: dict[str, list[str]] = {
+    "default": [],
+    "no levels of the sets as inputs": ["actor.levels=false", "critic.levels=false"],
+    "no control variate": ["collector.control_variate=null"],
+    "no starts near faces": [f"{STATES}.share=0"],
+    "no spread of the first layer": ["actor.spread=null", "critic.spread=null"],
+    "actor that ascends the Hamiltonian": ["pirl.actor_rule={_target_:pirl_rl.actor_rules.Hamiltonian}"],
+    "no last stage with a fixed actor": ["pirl.stages=[]"],
+    "squares in place of cross-entropy": ["pirl.td_criterion=squares"],
+    "whole episodes as returns": ["pirl.n_steps=200"],
+    "returns of five steps": ["pirl.n_steps=5"],
+    "residual and boundary, 1 and 10": ["pirl.final=[1,1,10]", "schedule.center=0.2", "schedule.steepness=30"],
+    "residual, 0.03": ["pirl.final=[1,0.03,0]", "schedule.center=0.3", "schedule.steepness=30"],
+    "half the updates": ["trainer.updates=6000"],
+    "twice the updates": ["trainer.updates=24000"],
+}
+"""The settings of each variant."""
+
+
+def main() -> None:
+    given = dict(text.split("=", 1) for text in sys.argv[1:])
+    problems = given.get("problems", "double_integrator,pendulum,zermelo,radial_exit-8").split(",")
+    seeds, out = given.get("seeds", "0,1").split(","), Path(given.get("out", "runs/recipe"))
+    chosen = given["only"].split(",") if "only" in given else [*VARIANTS]
+    rows = []
+    for variant in chosen:
+        folder = out / variant.replace(" ", "_").replace(",", "")
+        common = [f"out={folder}", f"seeds=[{','.join(seeds)}]", "evaluation.during=[]", "evaluation.final=[]"]
+        suite([*common, f"problems=[{','.join(problems)}]", *VARIANTS[variant]])
+        rows.append(f"| {variant} | {' | '.join(_cell(folder / name, seeds) for name in problems)} |")
+    print(f"\n| MSE of V, loss of success | {' | '.join(problems)} |\n| --- |{' ---: |' * len(problems)}")
+    print("\n".join(rows))
+
+
+def _cell(folder: Path, seeds: list[str]) -> str:
+    scores = [json.loads((folder / seed / "score.json").read_text(encoding="utf-8")) for seed in seeds]
+    mse, loss = (sum(score[key] for score in scores) / len(scores) for key in ("mse", "loss"))
+    return f"{mse:.1e}, {loss:.4f}"
+
+
+if __name__ == "__main__":
+    main()

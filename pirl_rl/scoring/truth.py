@@ -1,0 +1,51 @@
+"""Reference values of a problem at random states: exact, or those of the grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pirl_rl.grid import GridSolver
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.sampling.initial_states import sample_interior
+
+EARLIEST = 0.1
+"""The smallest time to go, as a share of the horizon: below it V is nearly the payoff."""
+
+GRID_POINTS = {1: 401, 2: 241}
+"""Nodes of the grid along each axis, by the number of states. In three states the grid takes too long for a table."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """States with their reference values.
+
+    Attributes:
+        tau: times to go (N,), in s, uniform above a tenth of the horizon.
+        x: states (N, n), uniform in the part of the box outside A and B.
+        value: V (N,), or None where neither a closed form nor a grid gives it.
+        source: "exact", "grid" or "none".
+        error: the mean of the grid's estimate of its own error, 0 for exact values.
+    """
+
+    tau: Tensor
+    x: Tensor
+    value: Tensor | None
+    source: str
+    error: float = 0.0
+
+
+def find_truth(problem: ReachAvoidProblem, count: int, seed: int) -> Truth:
+    """The reference values at `count` random states."""
+    rng = torch.Generator().manual_seed(seed)
+    x = sample_interior(problem, problem.states, count, rng, torch.float64)
+    tau = problem.horizon * (EARLIEST + (1 - EARLIEST) * torch.rand(count, generator=rng, dtype=x.dtype))
+    exact = problem.exact_value(tau, x)
+    if exact is not None:
+        return Truth(tau, x, exact, "exact")
+    if problem.states.dim not in GRID_POINTS:
+        return Truth(tau, x, None, "none")
+    grid = GridSolver(problem, GRID_POINTS[problem.states.dim]).solve()
+    return Truth(tau, x, grid.value(tau, x), "grid", grid.error(tau, x).mean().item())

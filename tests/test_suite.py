@@ -1,0 +1,124 @@
+"""The suite: truths, scores against known answers, the table, and the command, which goes on where it stopped."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+
+import pytest
+import torch
+
+from pirl_rl.commands.suite import main
+from pirl_rl.problems import CartPole, Exit1D, Pendulum, Reach1D
+from pirl_rl.scoring import PROBLEMS, Score, Truth, find_truth, markdown, measure
+from pirl_rl.simulator import Simulator
+
+SMALL = ["problems=[exit1d]", "states=50", "rollouts=20", "+debug=default", "evaluation.final=[]"]
+
+
+class Exact:
+    """A solution with the exact value and the best control, and V shifted by a number."""
+
+    dtype = torch.float64
+
+    def __init__(self, problem, shift=0.0):
+        self.problem, self.shift = problem, shift
+
+    def value(self, tau, x):
+        return self.problem.exact_value(tau, x) + self.shift
+
+    def policy(self, tau, x):
+        return self.problem.optimal_control(tau, x)
+
+
+def test_every_problem_of_the_suite_has_states_and_a_source():
+    assert len({overrides[0] for overrides in PROBLEMS.values()}) >= 12
+    assert find_truth(Exit1D(), 100, 0).source == "exact"
+    none = find_truth(CartPole(), 10, 0)
+    assert (none.source, none.value) == ("none", None)
+
+
+def test_the_grid_is_the_truth_where_no_closed_form_is_known(monkeypatch):
+    monkeypatch.setattr("pirl_rl.scoring.truth.GRID_POINTS", {2: 31})
+    truth = find_truth(Pendulum(), 100, 0)
+    assert truth.source == "grid"
+    assert 0 < truth.error < 0.1
+    assert ((truth.value >= -1e-6) & (truth.value <= 1 + 1e-6)).all()
+
+
+def test_states_are_reproducible_and_outside_the_sets():
+    one, other = (find_truth(Reach1D(), 200, seed=5) for _ in range(2))
+    assert torch.equal(one.x, other.x)
+    assert Reach1D().interior(one.x).all()
+    assert (one.tau >= 0.1 * Reach1D().horizon).all()
+
+
+def test_scores_of_the_exact_solution():
+    """Within four standard errors; Monte Carlo has 100 x 400 paths."""
+    problem = Reach1D()
+    truth, simulator = find_truth(problem, 100, 0), Simulator(problem, 0.05)
+    score = measure(Exact(problem), simulator, truth, 400, 12.0, 7)
+    assert score.mse < 1e-12
+    assert abs(score.loss) < 4 * score.loss_error
+    assert score.gap == pytest.approx(score.gap_noise, rel=0.2)
+    # The largest of 20 losses, each with a standard error of at most 0.5 / sqrt(4000).
+    assert abs(score.largest_loss) < 4 * 0.5 / 4000**0.5
+    assert (score.seconds, score.updates) == (12.0, 7)
+    shifted = measure(Exact(problem, 0.1), simulator, truth, 50, 0.0, 0)
+    assert shifted.mse == pytest.approx(0.01)
+    assert shifted.gap > 0.08
+
+
+def test_scores_without_a_truth_are_not_numbers():
+    problem = Reach1D()
+    truth = find_truth(problem, 20, 0)
+    score = measure(Exact(problem), Simulator(problem, 0.1), Truth(truth.tau, truth.x, None, "none"), 10, 0.0, 0)
+    assert math.isnan(score.mse)
+    assert math.isnan(score.largest_loss)
+    assert 0 <= score.success <= 1
+    row = markdown({"p": [score, score]}, {"p": "none"}).splitlines()[-1]
+    assert "nan" not in row
+    assert "| none | 2 |" in row
+
+
+def test_the_table_names_the_worst_seed():
+    def score(mse, success):
+        rest = dict.fromkeys(("mean_error", "largest_error", "loss", "loss_error", "largest_loss"), 0.0)
+        return Score(mse=mse, success=success, **rest, gap=0.0, gap_noise=0.0, seconds=60.0, updates=1)
+
+    row = markdown({"p": [score(1e-4, 0.5), score(3e-4, 0.4)]}, {"p": "exact"}).splitlines()[-1]
+    assert "| 2.0e-04 (3.0e-04) |" in row
+    assert "| 0.450 (0.400) |" in row
+
+
+def test_the_command_goes_on_where_it_stopped(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    main([*SMALL, "seeds=[3]"])
+    first = json.loads((tmp_path / "runs/suite/exit1d/3/score.json").read_text())
+    assert first["updates"] == 20
+    assert (tmp_path / "runs/suite/suite.png").is_file()
+    capsys.readouterr()
+    main([*SMALL, "seeds=[3,4]"])
+    assert json.loads((tmp_path / "runs/suite/exit1d/3/score.json").read_text()) == first
+    printed = capsys.readouterr().out
+    assert "seed=4" in printed
+    assert "seed=3" not in printed
+    assert (tmp_path / "runs/suite/suite.md").read_text().strip() in printed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["problems=[nowhere]"], "problems: expected names out of reach1d, .* got 'nowhere'"),
+        (["seeds=3"], "seeds: expected a list"),
+        (["problems=[exit1d]", "rollouts=0"], "rollouts: expected integers >= 1, got 0"),
+        (["problems=[exit1d]", "trainer.update=3"], "update"),
+    ],
+)
+def test_mistakes_are_named(arguments, message, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit):
+        main(arguments)
+    assert re.search(message, capsys.readouterr().err)
+    assert not any(tmp_path.iterdir())
