@@ -22,11 +22,13 @@ from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
 Objective = Callable[[Tensor], Tensor]
-"""Maps actions (N, m), normalised to [-1, 1], to numbers (N,), each of which depends on its own action alone."""
+"""Maps actions (N, m), normalised to [-1, 1], to numbers (N,), each of which depends on its own action alone.
+
+That of `hamiltonian` maps actions (*, N, m) to numbers (*, N)."""
 
 
 def hamiltonian(solution: Solution, tau: Tensor, x: Tensor, controlled_noise: bool) -> Objective:
-    """H (N,), in 1/s, as a function of the normalised action (N, m).
+    """H (*, N), in 1/s, as a function of normalised actions (*, N, m).
 
     Args:
         solution: gives V, whose action is frozen at the policy's, and the problem.
@@ -39,10 +41,11 @@ def hamiltonian(solution: Solution, tau: Tensor, x: Tensor, controlled_noise: bo
 
     def value(action: Tensor) -> Tensor:
         u = problem.controls.denormalize(action)
-        along = (problem.drift(x, u) * slope).sum(-1)
+        y = x.expand(*u.shape[:-1], x.shape[-1])
+        along = (problem.drift(y, u) * slope).sum(-1)
         if curvature is None:
             return along
-        sigma = problem.diffusion(x, u)
+        sigma = problem.diffusion(y, u)
         return along + (sigma * (curvature @ sigma)).sum((-2, -1)) / 2
 
     return value
@@ -103,14 +106,31 @@ def ascend(objective: Objective, action: Tensor, levels: Tensor, sweeps: int = 1
     return action, best
 
 
-def stakes(objective: Objective, action: Tensor) -> Tensor:
-    """How much each coordinate matters (N, m): the range of the objective at its bounds -1 and 1 and at the action."""
-    own = objective(action)
-    ranges = []
-    for i in range(action.shape[-1]):
-        values = torch.stack([own, *(objective(replaced(action, i, bound)) for bound in (-1.0, 1.0))])
-        ranges.append(values.amax(0) - values.amin(0))
-    return torch.stack(ranges, -1)
+def improved(objective: Objective, action: Tensor, levels: Tensor) -> tuple[Tensor, Tensor]:
+    """The best level of each coordinate while the others stand still, for all coordinates in one call of the objective.
+
+    If H is a sum of functions of one coordinate each, the best levels together are the maximum over the levels. Where
+    they are worse together than the best of them alone, that one alone is taken.
+
+    Args:
+        objective: the function to maximise, for actions (*, N, m).
+        action: the action (N, m) that is improved.
+        levels: the levels (k,) of each coordinate, bounds included.
+
+    Returns:
+        The action (N, m), whose objective is at least that of the given one, and how much each coordinate matters
+        (N, m): the range of the objective over its levels and the given action.
+    """
+    size = action.shape[-1]
+    own = torch.eye(size, dtype=torch.bool, device=action.device)[:, None, None]
+    values, before = objective(torch.where(own, levels[:, None, None], action)), objective(action)
+    top, index = values.max(1)
+    together = torch.where(top > before, levels[index], action.mT).mT
+    alone, which = top.max(0)
+    single = torch.where(torch.nn.functional.one_hot(which, size).bool(), together, action)
+    best = torch.where((objective(together) >= alone).unsqueeze(-1), together, single)
+    stakes = torch.maximum(top, before) - torch.minimum(values.amin(1), before)
+    return best, stakes.mT
 
 
 def replaced(action: Tensor, column: int, level: Tensor | float) -> Tensor:

@@ -9,6 +9,17 @@ from typing import Any
 import torch
 
 
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function, compiled at its first call for the shapes that it gets.
+
+    Each result has programs of its own: trainings of many problems in one process would otherwise share, and exhaust,
+    the small number that the compiler keeps for one function. Shapes are constants, because derivatives of the physics
+    in forward mode do not compile for others.
+    """
+    # PyTorch's own overloads lack the second argument.
+    return torch.compile(function, dynamic=False, isolate_recompiles=True)  # pyright: ignore[reportCallIssue]
+
+
 class Compiled:
     """A function that is compiled at its first call; where that fails, it runs eagerly after one warning.
 
@@ -19,7 +30,7 @@ class Compiled:
 
     def __init__(self, function: Callable[..., Any], name: str):
         self.function, self.name = function, name
-        self._called: Callable[..., Any] = torch.compile(function)
+        self._called: Callable[..., Any] = compiled(function)
 
     def __call__(self, *args: Any) -> Any:
         try:

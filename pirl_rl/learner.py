@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import SoftUpdate
 
-from pirl_rl.compilation import is_compiler_failure
+from pirl_rl.compilation import compiled, is_compiler_failure
 from pirl_rl.curriculum import StageSettings
 from pirl_rl.errors import ArgumentError, DivergenceError
 from pirl_rl.losses import PIRLLoss
@@ -155,7 +155,7 @@ class Learner:
         self._actor_loss: LossFunction = compiler(self.loss.actor_loss) if rule.compiles_whole else self.loss.actor_loss
 
     def _compiler(self) -> Callable[[Any], Any]:
-        return torch.compile if self.compile else lambda function: function
+        return compiled if self.compile else lambda function: function
 
     def _evaluated(self, which: Literal["critic", "actor"], batch: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """A loss and its terms; if compilation fails, the losses run eagerly from then on."""

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pirl_rl import Box, ReachAvoidProblem
 from pirl_rl.actor_rules import BestControl, Hamiltonian
-from pirl_rl.ascent import ascend, hamiltonian, stakes
+from pirl_rl.ascent import ascend, hamiltonian, improved
 from pirl_rl.errors import ArgumentError
 from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.problem import has_controlled_noise
@@ -75,9 +75,50 @@ def test_the_ascent_finds_the_best_of_all_levels(controlled):
     assert torch.allclose(objective(action), value)
 
 
-def test_stakes_are_the_slopes_of_an_affine_objective():
-    slope = torch.tensor([3.0, 0.0, -0.5])
-    assert torch.allclose(stakes(lambda action: action @ slope, torch.zeros(4, 3)), 2 * slope.abs().expand(4, 3))
+def test_all_coordinates_at_once_are_the_best_of_a_sum():
+    """f(a) = sum_i (s_i a_i - (a_i - 0.5)^2 [i = 1]): the best of the levels -1, 0, 1 is (1, 0 or 1, -1)."""
+    slope = torch.tensor([2.0, 0.3, -1.0])
+
+    def objective(action):
+        return action @ slope - (action[..., 1] - 0.5).square()
+
+    start = torch.tensor([[0.2, -0.7, 0.0], [-1.0, 1.0, 1.0]])
+    best, stakes = improved(objective, start, torch.tensor([-1.0, 0.0, 1.0]))
+    assert torch.equal(best, torch.tensor([[1.0, 1.0, -1.0]]).expand(2, 3))
+    assert torch.allclose(stakes[:, [0, 2]], torch.tensor([[4.0, 2.0], [4.0, 2.0]]))
+
+
+def test_coordinates_that_are_worse_together_are_not_changed_together():
+    """f(a) = -(a_1 + a_2 - 1)^2 + a_1/2: from (0, 0) each alone goes to 1, and both together would overshoot."""
+
+    def objective(action):
+        return -(action.sum(-1) - 1).square() + 0.5 * action[..., 0]
+
+    best, _ = improved(objective, torch.zeros(1, 2), torch.tensor([-1.0, 0.0, 1.0]))
+    assert best.tolist() == [[1.0, 0.0]]
+
+
+@pytest.mark.parametrize("controlled", [False, True])
+def test_an_improvement_is_none_for_the_worse(controlled):
+    problem = Steered(controlled)
+    solution, (tau, x) = solution_of(problem), points(problem)
+    objective = hamiltonian(solution, tau, x, controlled)
+    start = 2 * torch.rand(len(x), 3, generator=torch.Generator().manual_seed(2)) - 1
+    best, stakes = improved(objective, start, torch.linspace(-1, 1, 5))
+    assert (objective(best) >= objective(start) - 1e-6).all()
+    assert (stakes >= 0).all()
+    if not controlled:  # H is affine in u, so that a vertex is the maximum
+        vertices = torch.tensor(list(itertools.product((-1.0, 1.0), repeat=3)))
+        largest = torch.stack([objective(vertex.expand(len(x), 3)) for vertex in vertices]).amax(0)
+        assert torch.allclose(objective(best), largest, atol=1e-6)
+
+
+def test_more_controls_take_fewer_points():
+    problem = Steered()
+    solution, (tau, x) = solution_of(problem), points(problem)
+    batch = TensorDict({"tau": tau.unsqueeze(-1), "state": x}, [len(x)])
+    few = BestControl(problem, budget=3 * 10)
+    assert torch.equal(few(solution, batch, batch), BestControl(problem)(solution, batch[:10], batch[:10]))
 
 
 def test_the_rule_turns_a_saturated_actor_round_where_the_gradient_of_the_hamiltonian_does_not():
@@ -113,7 +154,9 @@ def test_masked_points_do_not_count():
 
 
 def test_what_the_rule_refuses():
-    with pytest.raises(ArgumentError, match=r"actor_rule.levels: expected at least 2, got 1"):
+    with pytest.raises(ArgumentError, match="levels >= 2 and budget >= 1, got 1 and 8192"):
         BestControl(Reach1D(), levels=1)
+    with pytest.raises(ArgumentError, match="budget >= 1, got 5 and 0"):
+        BestControl(Reach1D(), budget=0)
     with pytest.raises(ArgumentError, match=r"expected critic\.action_input=false"):
         BestControl(Reach1D()).check(Critic(Reach1D(), action_input=True))

@@ -7,7 +7,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from pirl_rl.actor_rules.base import ActorRule
-from pirl_rl.ascent import ascend, hamiltonian, stakes
+from pirl_rl.ascent import hamiltonian, improved
 from pirl_rl.errors import ArgumentError
 from pirl_rl.networks import Critic
 from pirl_rl.operators import masked_mean
@@ -25,32 +25,36 @@ class BestControl(ActorRule):
     vanish where the tanh is saturated at the wrong bound: unlike a gradient of the Hamiltonian in u, the rule
     corrects such an action.
 
+    Each coordinate takes its best level while the others stand still, see `pirl_rl.ascent.improved`.
+
     Args:
         problem: the physics.
         levels: the number of levels of each coordinate of the control among the candidates, bounds included; at least
             2. Two levels find the maximum where the drift is affine in u and sigma does not depend on u.
+        budget: the largest number of points times controls; of more points the first are taken, so that an update of
+            the actor does not cost more with more controls.
 
     Raises:
-        ArgumentError: `levels` is below 2.
+        ArgumentError: `levels` is below 2, or `budget` below 1.
     """
 
-    def __init__(self, problem: ReachAvoidProblem, levels: int = 5):
-        if levels < 2:
-            raise ArgumentError(f"actor_rule.levels: expected at least 2, got {levels}")
-        self.levels, self.controlled_noise = levels, has_controlled_noise(problem)
+    def __init__(self, problem: ReachAvoidProblem, levels: int = 5, budget: int = 8_192):
+        if levels < 2 or budget < 1:
+            raise ArgumentError(f"actor_rule: expected levels >= 2 and budget >= 1, got {levels} and {budget}")
+        self.levels, self.budget, self.controlled_noise = levels, budget, has_controlled_noise(problem)
 
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
-        tau, x = points["tau"], points["state"]
+        count = max(1, self.budget // solution.problem.controls.dim)
+        tau, x = points["tau"][:count], points["state"][:count]
         logits = solution.actor.logits(tau, x)
         with torch.no_grad():
             action = torch.tanh(logits)
             objective = hamiltonian(solution, tau.squeeze(-1), x, self.controlled_noise)
-            best, _ = ascend(objective, action, torch.linspace(-1, 1, self.levels).to(action))
-            weight = stakes(objective, action)
+            best, weight = improved(objective, action, torch.linspace(-1, 1, self.levels).to(action))
         # pi = tanh(z) is 2 sigmoid(2 z) - 1, so that 2 z is the logit of (1 + pi)/2.
         entropy = torch.nn.functional.binary_cross_entropy_with_logits(2 * logits, (1 + best) / 2, reduction="none")
         loss = solution.problem.horizon * (weight * entropy).sum(-1)
-        mask = points["mask"] if "mask" in points.keys() else torch.ones_like(loss, dtype=torch.bool)
+        mask = points["mask"][:count] if "mask" in points.keys() else torch.ones_like(loss, dtype=torch.bool)
         return -masked_mean(loss, mask)
 
     def check(self, critic: Critic, exploration_noise: float | None = None) -> None:
