@@ -24,7 +24,10 @@ from pirl_rl.solution import Solution
 Objective = Callable[[Tensor], Tensor]
 """Maps actions (N, m), normalised to [-1, 1], to numbers (N,), each of which depends on its own action alone.
 
-That of `hamiltonian` maps actions (*, N, m) to numbers (*, N)."""
+Those of `hamiltonian` and `value_ahead` map actions (*, N, m) to numbers (*, N)."""
+
+Flow = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""Maps states (N, n), controls (N, m) and lengths (N,), in s, to the states (N, n) after a step without noise."""
 
 
 def hamiltonian(solution: Solution, tau: Tensor, x: Tensor, controlled_noise: bool) -> Objective:
@@ -51,34 +54,39 @@ def hamiltonian(solution: Solution, tau: Tensor, x: Tensor, controlled_noise: bo
     return value
 
 
-def value_ahead(solution: Solution, simulator: Simulator, tau: Tensor, x: Tensor, steps: int) -> Objective:
-    """V after a few control steps without noise, as a function of the action (N, m) that is held over them.
+def value_ahead(
+    solution: Solution, simulator: Simulator, tau: Tensor, x: Tensor, steps: int, flow: Flow | None = None
+) -> Objective:
+    """V after a few control steps without noise, the first of them with the action (*, N, m), the others with pi.
 
     A path stops at the end of the step in which it enters A or B, and at tau = 0. Where sigma depends on the control,
-    the expectation of the noise's effect is added to first order: 1/2 Tr(sigma sigma^T hess V) at x times the length.
+    the expectation of the noise's effect is added to first order: 1/2 Tr(sigma sigma^T hess V) at x times the length
+    of the first step.
 
     Args:
-        solution: gives V and the problem.
+        solution: gives V, pi and the problem.
         simulator: simulates the control steps.
         tau: times to go (N,), in s.
         x: states (N, n).
         steps: the number of control steps, at least 1.
+        flow: replaces `simulator.flow`, compiled for example.
     """
-    problem, clock = solution.problem, simulator.clock
+    problem, clock, flow = solution.problem, simulator.clock, flow or simulator.flow
     curvature = solution.hessian(tau, x) if has_controlled_noise(problem) else None
 
     def value(action: Tensor) -> Tensor:
-        u, t, y = problem.controls.denormalize(action), tau, x
-        for _ in range(steps):
+        u, shape = problem.controls.denormalize(action), action.shape[:-1]
+        t, y = tau.expand(shape).flatten(), x.expand(*shape, -1).flatten(0, -2)
+        for index in range(steps):
             left, shortfall = clock.split(t)
             live, h = problem.interior(y) & (left > 0), clock.length(left, shortfall).to(y)
-            y = torch.where(live.unsqueeze(-1), simulator.flow(y, u, h), y)
+            y = torch.where(live.unsqueeze(-1), flow(y, solution.policy(t, y) if index else u.flatten(0, -2), h), y)
             t = torch.where(live, t - h, t).clamp(min=0)
-        ahead = solution.value(t, y)
+        ahead = solution.value(t, y).reshape(shape)
         if curvature is None:
             return ahead
-        sigma = problem.diffusion(x, u)
-        return ahead + (tau - t) * (sigma * (curvature @ sigma)).sum((-2, -1)) / 2
+        sigma, length = problem.diffusion(x.expand(*shape, -1), u), tau.clamp(max=simulator.dt)
+        return ahead + length * (sigma * (curvature @ sigma)).sum((-2, -1)) / 2
 
     return value
 

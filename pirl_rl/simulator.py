@@ -28,6 +28,7 @@ from pirl_rl.clock import Clock
 from pirl_rl.compilation import Compiled
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.sigma import times, transposed_times
 
 
 class Step(NamedTuple):
@@ -156,12 +157,7 @@ class Simulator:
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """One sub-step: states (N, n), sigma dW (N, n), and whether paths are in A and in B or crossed a face."""
         problem, sigma = self.problem, self.problem.diffusion(x, u)
-        noise = normal * h.sqrt()
-        if all(stride == 0 for stride in sigma.stride()[:-2]):
-            # sigma is one matrix, expanded to all states: one product of two matrices replaces N small ones.
-            kick = (sigma[(0,) * (sigma.ndim - 2)] @ noise).mT
-        else:
-            kick = (sigma * noise.movedim(0, -1).unsqueeze(-2)).sum(-1)
+        kick = times(sigma, (normal * h.sqrt()).mT)
         moved = problem.states.wrap(x + problem.drift(x, u) * h[..., None] + kick)
         reached, failed = problem.reached(moved), problem.failed(moved)
         if target is not None:
@@ -176,11 +172,19 @@ class Simulator:
     def _crossed(constraints, x, moved, sigma, h, uniform) -> tuple[Tensor, Tensor]:
         """Whether the bridge crossed each face, and whether all other constraints hold at both ends; (N, k) bool."""
         before, after = constraints(x), constraints(moved)
-        columns = [torch.func.jvp(constraints, (x,), (column,))[1] for column in sigma.unbind(-1)]
-        variance = torch.stack([column**2 for column in columns]).sum(0) * h[..., None]
+        variance = _squared_noise(constraints, x, sigma, before.shape[-1]) * h[..., None]
         exponent = -2 * before * after / variance
         # Where the variance is 0, the exponent is NaN or infinite, and the face is not crossed between the ends.
         probability = torch.where((variance > 0) & (before > 0) & (after > 0), exponent.exp(), torch.zeros_like(before))
         held = (before <= 0) & (after <= 0)
         others_hold = held.sum(-1, keepdim=True) - held.long() == before.shape[-1] - 1
         return uniform < probability, others_hold
+
+
+def _squared_noise(constraints: Callable[[Tensor], Tensor], x: Tensor, sigma: Tensor, count: int) -> Tensor:
+    """|sigma^T grad g|^2 (N, k) of `count` constraints g at x (N, n), by the fewer of w and k derivatives."""
+    if sigma.shape[-1] <= count:
+        along = [torch.func.jvp(constraints, (x,), (column,))[1] for column in sigma.unbind(-1)]
+        return torch.stack([rate**2 for rate in along]).sum(0)
+    slopes = [torch.func.grad(lambda y, i=i: constraints(y)[..., i].sum())(x) for i in range(count)]
+    return torch.stack([transposed_times(sigma, slope).square().sum(-1) for slope in slopes], -1)

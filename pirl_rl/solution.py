@@ -71,21 +71,24 @@ class Solution:
         u = self.problem.controls.denormalize(action) if u is None else u
         return generator(self.critic.at(action), self.problem, tau, x, u).mean(0)
 
-    @torch.no_grad()
+    # The next two are called by compiled losses. The compiler does not follow decorators of methods of objects that
+    # are made while it traces, hence the blocks.
+
     def gradient(self, tau: Tensor, x: Tensor) -> Tensor:
         """The gradient of `raw_value` in x (N, n), per unit of the state; the action of the critics is frozen."""
-        tau, x = self._own(tau, x)
-        value = self.critic.at(self._action(tau, x))
-        return torch.func.grad(lambda y: value(tau, y).mean(0).sum())(x)
+        with torch.no_grad():
+            tau, x = self._own(tau, x)
+            value = self.critic.at(self._action(tau, x))
+            return torch.func.grad(lambda y: value(tau, y).mean(0).sum())(x)
 
-    @torch.no_grad()
     def hessian(self, tau: Tensor, x: Tensor) -> Tensor:
         """The second derivatives of `raw_value` in x (N, n, n); the action of the critics is frozen."""
-        tau, x = self._own(tau, x)
-        value = self.critic.at(self._action(tau, x))
-        slope = torch.func.grad(lambda y: value(tau, y).mean(0).sum())
-        columns = [torch.func.jvp(slope, (x,), (axis.expand_as(x),))[1] for axis in torch.eye(x.shape[-1]).to(x)]
-        return torch.stack(columns, -1)
+        with torch.no_grad():
+            tau, x = self._own(tau, x)
+            value = self.critic.at(self._action(tau, x))
+            slope = torch.func.grad(lambda y: value(tau, y).mean(0).sum())
+            columns = [torch.func.jvp(slope, (x,), (axis.expand_as(x),))[1] for axis in torch.eye(x.shape[-1]).to(x)]
+            return torch.stack(columns, -1)
 
     def _own(self, tau: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         return tau.to(self.dtype), self.problem.states.wrap(x.to(self.dtype))

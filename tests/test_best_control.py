@@ -11,11 +11,12 @@ from torch import Tensor
 
 from pirl_rl import Box, ReachAvoidProblem
 from pirl_rl.actor_rules import BestControl, Hamiltonian
-from pirl_rl.ascent import ascend, hamiltonian, improved
+from pirl_rl.ascent import ascend, hamiltonian, improved, value_ahead
 from pirl_rl.errors import ArgumentError
 from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.problem import has_controlled_noise
 from pirl_rl.problems import Reach1D
+from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
 
@@ -117,8 +118,35 @@ def test_more_controls_take_fewer_points():
     problem = Steered()
     solution, (tau, x) = solution_of(problem), points(problem)
     batch = TensorDict({"tau": tau.unsqueeze(-1), "state": x}, [len(x)])
-    few = BestControl(problem, budget=3 * 10)
-    assert torch.equal(few(solution, batch, batch), BestControl(problem)(solution, batch[:10], batch[:10]))
+    few, all_of_them = (BestControl(problem, Simulator(problem, 0.1), **budget) for budget in ({"budget": 3 * 10}, {}))
+    assert torch.equal(few(solution, batch, batch), all_of_them(solution, batch[:10], batch[:10]))
+
+
+@pytest.mark.parametrize("controlled", [False, True])
+def test_a_short_look_ahead_is_the_hamiltonian(controlled):
+    """(V ahead of u - V ahead of 0)/dt tends to H(u) - H(0), with an error of the order of dt."""
+    problem = Steered(controlled)
+    solution, (tau, x), dt = solution_of(problem), points(problem), 1e-4
+    ahead = value_ahead(solution, Simulator(problem, dt), tau, x, 1)
+    slope = hamiltonian(solution, tau, x, controlled)
+    actions = 2 * torch.rand(4, len(x), 3, generator=torch.Generator().manual_seed(3)) - 1
+    still = torch.zeros(len(x), 3)
+    inside = problem.interior(x) & (solution.raw_value(tau, x) > 0) & (solution.raw_value(tau, x) < 1)
+    expected, found = slope(actions) - slope(still), (ahead(actions) - ahead(still)) / dt
+    torch.testing.assert_close(found[:, inside], expected[:, inside], rtol=0.01, atol=0.01)
+
+
+def test_the_policy_acts_after_the_first_step_of_a_look_ahead():
+    """Two steps ahead with a are one step with a, and V one step ahead of there with the policy."""
+    problem = Steered()
+    solution, (tau, x), simulator = solution_of(problem), points(problem), Simulator(problem, 0.05)
+    action = torch.full((len(x), 3), 0.3)
+    after = simulator.flow(x, problem.controls.denormalize(action), torch.full((len(x),), 0.05))
+    policy = problem.controls.normalize(solution.policy(tau - 0.05, after))
+    alive = problem.interior(x) & problem.interior(after) & (tau > 0.1)
+    expected = value_ahead(solution, simulator, tau - 0.05, after, 1)(policy)
+    found = value_ahead(solution, simulator, tau, x, 2)(action)
+    torch.testing.assert_close(found[alive], expected[alive])
 
 
 def test_the_rule_turns_a_saturated_actor_round_where_the_gradient_of_the_hamiltonian_does_not():
@@ -126,7 +154,7 @@ def test_the_rule_turns_a_saturated_actor_round_where_the_gradient_of_the_hamilt
     tau, x = points(problem, 256)
     replay = TensorDict({"tau": tau.unsqueeze(-1), "state": x}, batch_size=[256])
     pushed = {}
-    for rule in (BestControl(problem), Hamiltonian(problem)):
+    for rule in (BestControl(problem, Simulator(problem, 0.1)), Hamiltonian(problem)):
         solution = Solution(problem, Actor(problem), stack([Rising(problem)]))
         last = solution.actor.layers[-2]
         torch.nn.init.zeros_(last.weight)
@@ -149,14 +177,14 @@ def test_masked_points_do_not_count():
     problem = Steered()
     solution, (tau, x) = solution_of(problem), points(problem)
     every = TensorDict({"tau": tau.unsqueeze(-1), "state": x, "mask": torch.arange(64) < 32}, batch_size=[64])
-    rule = BestControl(problem)
+    rule = BestControl(problem, Simulator(problem, 0.1))
     assert torch.allclose(rule(solution, every, every), rule(solution, every[:32], every[:32].exclude("mask")))
 
 
 def test_what_the_rule_refuses():
-    with pytest.raises(ArgumentError, match="levels >= 2 and budget >= 1, got 1 and 8192"):
-        BestControl(Reach1D(), levels=1)
-    with pytest.raises(ArgumentError, match="budget >= 1, got 5 and 0"):
-        BestControl(Reach1D(), budget=0)
+    with pytest.raises(ArgumentError, match="steps >= 0, levels >= 2 and budget >= 1, got 0, 1 and 8192"):
+        BestControl(Reach1D(), Simulator(Reach1D(), 0.1), levels=1)
+    with pytest.raises(ArgumentError, match="budget >= 1, got 0, 5 and 0"):
+        BestControl(Reach1D(), Simulator(Reach1D(), 0.1), budget=0)
     with pytest.raises(ArgumentError, match=r"expected critic\.action_input=false"):
-        BestControl(Reach1D()).check(Critic(Reach1D(), action_input=True))
+        BestControl(Reach1D(), Simulator(Reach1D(), 0.1)).check(Critic(Reach1D(), action_input=True))

@@ -8,11 +8,11 @@ from functools import partial
 
 import pytest
 import torch
-from small import at_each_update, command, small_trainer
+from small import EVENTS, QUICK, at_each_update, command, small_trainer
 from torch._dynamo.utils import counters
 
 from pirl_rl import learner
-from pirl_rl.actor_rules import ClippedSurrogate, LookAhead
+from pirl_rl.actor_rules import BestControl, ClippedSurrogate, LookAhead
 from pirl_rl.simulator import Simulator
 
 RULES = (
@@ -27,7 +27,12 @@ RULES = (
 def eager_calls(monkeypatch) -> list[str]:
     """Names of what should run compiled, one for each time that Python itself runs it."""
     calls: list[str] = []
-    for owner, name in ((learner.PIRLLoss, "critic_loss"), (ClippedSurrogate, "__call__"), (Simulator, "flow")):
+    for owner, name in (
+        (learner.PIRLLoss, "critic_loss"),
+        (BestControl, "__call__"),
+        (ClippedSurrogate, "__call__"),
+        (Simulator, "flow"),
+    ):
         inner = getattr(owner, name)
 
         def watched(self, *arguments, inner=inner, label=f"{owner.__name__}.{name}"):
@@ -88,3 +93,18 @@ def test_a_new_rule_without_a_compiler_on_the_path(tmp_path):
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("updates run eagerly") == 1
     assert "run      " in done.stdout
+
+
+@pytest.mark.parametrize("experiment", ["reach1d", "dubins"])
+def test_the_default_losses_are_one_program_each(experiment, tmp_path, monkeypatch):
+    """Traced whole by the compiler's front end; a loss that breaks into pieces costs several times as much."""
+    calls = eager_calls(monkeypatch)
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager", fullgraph=True))
+    torch._dynamo.reset()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="updates run eagerly")
+        warnings.filterwarnings("error", message=".* runs eagerly")
+        trainer = small_trainer(tmp_path, "compile=true", base=(f"+experiment={experiment}", *QUICK[1:], *EVENTS))
+        trainer.train()
+    assert isinstance(trainer.learner.loss.actor_rule, BestControl)
+    assert calls == []

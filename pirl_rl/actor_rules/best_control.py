@@ -1,17 +1,21 @@
-"""Imitation of the best control of the Hamiltonian among a few levels of each coordinate."""
+"""Imitation of the best control among a few levels of each coordinate, by the Hamiltonian or by a look ahead."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from pirl_rl.actor_rules.base import ActorRule
-from pirl_rl.ascent import hamiltonian, improved
+from pirl_rl.ascent import Flow, Objective, hamiltonian, improved, value_ahead
 from pirl_rl.errors import ArgumentError
 from pirl_rl.networks import Critic
 from pirl_rl.operators import masked_mean
 from pirl_rl.problem import ReachAvoidProblem, has_controlled_noise
+from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
 
@@ -25,23 +29,41 @@ class BestControl(ActorRule):
     vanish where the tanh is saturated at the wrong bound: unlike a gradient of the Hamiltonian in u, the rule
     corrects such an action.
 
+    The Hamiltonian is the limit of a control that is never held. Where a control step is long, as with fewer than a
+    hundred of them in the horizon, V after `steps` noise-free control steps takes its place, divided by dt: the first
+    step with the candidate, the others with the policy, the rollout algorithm of D. Bertsekas (Rollout, Policy
+    Iteration, and Distributed Reinforcement Learning, 2020).
+
     Each coordinate takes its best level while the others stand still, see `pirl_rl.ascent.improved`.
 
     Args:
         problem: the physics.
+        simulator: simulates the control steps.
+        steps: the number of control steps ahead; 0 takes the Hamiltonian.
         levels: the number of levels of each coordinate of the control among the candidates, bounds included; at least
             2. Two levels find the maximum where the drift is affine in u and sigma does not depend on u.
         budget: the largest number of points times controls; of more points the first are taken, so that an update of
             the actor does not cost more with more controls.
 
     Raises:
-        ArgumentError: `levels` is below 2, or `budget` below 1.
+        ArgumentError: `steps` is below 0, `levels` below 2, or `budget` below 1.
     """
 
-    def __init__(self, problem: ReachAvoidProblem, levels: int = 5, budget: int = 8_192):
-        if levels < 2 or budget < 1:
-            raise ArgumentError(f"actor_rule: expected levels >= 2 and budget >= 1, got {levels} and {budget}")
-        self.levels, self.budget, self.controlled_noise = levels, budget, has_controlled_noise(problem)
+    def __init__(
+        self,
+        problem: ReachAvoidProblem,
+        simulator: Simulator,
+        steps: int = 0,
+        levels: int = 5,
+        budget: int = 8_192,
+    ):
+        if steps < 0 or levels < 2 or budget < 1:
+            raise ArgumentError(
+                f"actor_rule: expected steps >= 0, levels >= 2 and budget >= 1, got {steps}, {levels} and {budget}"
+            )
+        self.simulator, self.steps, self.levels, self.budget = simulator, steps, levels, budget
+        self.controlled_noise, self.compiles_whole = has_controlled_noise(problem), steps == 0
+        self.flow: Flow = simulator.flow
 
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
         count = max(1, self.budget // solution.problem.controls.dim)
@@ -49,16 +71,26 @@ class BestControl(ActorRule):
         logits = solution.actor.logits(tau, x)
         with torch.no_grad():
             action = torch.tanh(logits)
-            objective = hamiltonian(solution, tau.squeeze(-1), x, self.controlled_noise)
+            objective = self._objective(solution, tau.squeeze(-1), x)
             best, weight = improved(objective, action, torch.linspace(-1, 1, self.levels).to(action))
         # pi = tanh(z) is 2 sigmoid(2 z) - 1, so that 2 z is the logit of (1 + pi)/2.
         entropy = torch.nn.functional.binary_cross_entropy_with_logits(2 * logits, (1 + best) / 2, reduction="none")
-        loss = solution.problem.horizon * (weight * entropy).sum(-1)
+        duration = self.simulator.dt if self.steps else 1.0
+        loss = solution.problem.horizon / duration * (weight * entropy).sum(-1)
         mask = points["mask"][:count] if "mask" in points.keys() else torch.ones_like(loss, dtype=torch.bool)
         return -masked_mean(loss, mask)
+
+    def _objective(self, solution: Solution, tau: Tensor, x: Tensor) -> Objective:
+        if self.steps:
+            return value_ahead(solution, self.simulator, tau, x, self.steps, self.flow)
+        return hamiltonian(solution, tau, x, self.controlled_noise)
 
     def check(self, critic: Critic, exploration_noise: float | None = None) -> None:
         if critic.action_input:
             raise ArgumentError(
                 "actor_rule: BestControl differentiates V(tau, x), expected critic.action_input=false, got true"
             )
+
+    def compile(self, compiler: Callable[[Any], Any]) -> None:
+        """Compile the simulator's noise-free step."""
+        self.flow = compiler(self.simulator.flow)

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from pirl_rl.compilation import Compiled
 from pirl_rl.errors import ArgumentError
+from pirl_rl.sigma import transposed_times
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
@@ -91,7 +92,7 @@ class ControlVariate(nn.Module):
         value, problem = self.critic.at(action), self.simulator.problem
         slope = torch.func.grad(lambda x: value(tau.squeeze(-1), x).mean(0).sum())(state)
         sigma = problem.diffusion(state, problem.controls.denormalize(action))
-        deviation = (slope.unsqueeze(-1) * sigma).sum(-2).norm(dim=-1, keepdim=True) * self.simulator.dt**0.5
+        deviation = transposed_times(sigma, slope).norm(dim=-1, keepdim=True) * self.simulator.dt**0.5
         return slope * (self.limit / deviation.clamp(min=self.limit))
 
 

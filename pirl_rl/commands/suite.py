@@ -7,6 +7,10 @@ the folder `out` is not repeated, so that a suite that was stopped goes on. Sett
     seeds     seeds of the trainings, [0] by default
     states    the number of states at which a run is measured, 400 by default
     rollouts  the number of paths from each of them, 400 by default
+    against   alternatives that are measured at the same states, out of grid, lqr, ppo and sac; none by default.
+              The grid is timed until its error is that of the worst run. The others give a policy; ppo and sac are
+              those of Stable-Baselines3, from the extra `baselines`
+    patience  how many times as long as the recipe ppo and sac train, 10 by default
     out       the folder, runs/suite by default
 """
 
@@ -31,11 +35,32 @@ from pirl_rl.configuration import load_config
 from pirl_rl.errors import ConfigError
 from pirl_rl.figures import draw_suite, save_figures
 from pirl_rl.files import replacing
+from pirl_rl.rivals import RIVALS
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.runs.load import load_run
-from pirl_rl.scoring import PROBLEMS, Score, Truth, find_truth, markdown, measure
+from pirl_rl.scoring import (
+    PROBLEMS,
+    Alternative,
+    Score,
+    Truth,
+    find_truth,
+    markdown,
+    measure,
+    play_rival,
+    race_grid,
+)
 
-DEFAULTS: dict[str, Any] = {"problems": [*PROBLEMS], "seeds": [0], "states": 400, "rollouts": 400, "out": "runs/suite"}
+DEFAULTS: dict[str, Any] = {
+    "problems": [*PROBLEMS],
+    "seeds": [0],
+    "states": 400,
+    "rollouts": 400,
+    "against": [],
+    "patience": 10.0,
+    "out": "runs/suite",
+}
+
+ALTERNATIVES = ("grid", *RIVALS)
 
 STATES_SEED = 20_000
 """The seed of the states at which runs are measured; no training uses it."""
@@ -49,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     quiet_libraries()
     with reported(Path()):
         options, overrides = _options(arguments)
-        folder, scores, sources = Path(options["out"]), {}, {}
+        folder, scores, sources, others = Path(options["out"]), {}, {}, {}
         for name in options["problems"]:
             truth = _truth(folder / name, name, overrides, options["states"])
             sources[name] = truth.source
@@ -57,11 +82,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 _score(folder / name / str(seed), name, [*overrides, f"seed={seed}"], truth, options["rollouts"])
                 for seed in options["seeds"]
             ]
+            others[name] = {
+                other: _alternative(folder / name, other, scores[name], truth, options) for other in options["against"]
+            }
+            table = markdown(scores, sources, others)
             with replacing(folder / "suite.md") as file:
-                file.write(markdown(scores, sources) + "\n")
+                file.write(table + "\n")
         figure = draw_suite({name: [asdict(run) for run in runs] for name, runs in scores.items()})
         paths = save_figures({"suite": figure}, folder)
-        print(markdown(scores, sources))
+        print(table)
         print(f"written  {folder / 'suite.md'}")
         for path in paths:
             print(f"figure   {path}")
@@ -79,11 +108,14 @@ def _options(arguments: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
     except (OmegaConfBaseException, ValueError) as error:
         raise ConfigError(f"suite: {error}") from None
     options = DEFAULTS | given
-    for name in ("problems", "seeds"):
-        if not isinstance(options[name], list) or not options[name]:
+    for name in ("problems", "seeds", "against"):
+        if not isinstance(options[name], list) or not (options[name] or name == "against"):
             raise ConfigError(f"{name}: expected a list such as {name}={DEFAULTS[name][:2]}, got {options[name]!r}")
-    if unknown := [name for name in options["problems"] if name not in PROBLEMS]:
-        raise ConfigError(f"problems: expected names out of {', '.join(PROBLEMS)}, got {unknown[0]!r}")
+    for name, known in (("problems", PROBLEMS), ("against", ALTERNATIVES)):
+        if unknown := [entry for entry in options[name] if entry not in known]:
+            raise ConfigError(f"{name}: expected names out of {', '.join(known)}, got {unknown[0]!r}")
+    if not isinstance(options["patience"], (int, float)) or not options["patience"] > 0:
+        raise ConfigError(f"patience: expected a number > 0, got {options['patience']!r}")
     for name, entries in (
         ("seeds", options["seeds"]),
         ("states", [options["states"]]),
@@ -128,3 +160,25 @@ def _score(folder: Path, name: str, overrides: Sequence[str], truth: Truth, roll
     with replacing(path) as file:
         file.write(json.dumps(asdict(score), indent=2) + "\n")
     return score
+
+
+def _alternative(
+    folder: Path, other: str, scores: Sequence[Score], truth: Truth, options: dict[str, Any]
+) -> Alternative | None:
+    """An alternative at the states of the truth, from its file if it is there; None where it does not suit."""
+    path = folder / f"{other}.json"
+    if path.is_file():
+        found = json.loads(path.read_text(encoding="utf-8"))
+        return None if found is None else Alternative(**found)
+    trained = load_run(folder / str(options["seeds"][0]), trust=load_config(folder / str(options["seeds"][0])).trust)
+    print(f"{folder.name}: {other}", flush=True)
+    if other == "grid":
+        alternative = race_grid(trained.problem, truth, max(score.mse for score in scores))
+    else:
+        seconds = options["patience"] * sum(score.seconds for score in scores) / len(scores)
+        alternative = play_rival(
+            other, trained.problem, trained.simulator, truth, seconds, options["rollouts"], options["seeds"][0]
+        )
+    with replacing(path) as file:
+        file.write(json.dumps(None if alternative is None else asdict(alternative), indent=2) + "\n")
+    return alternative

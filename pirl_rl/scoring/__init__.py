@@ -1,10 +1,21 @@
 """The suite: problems with known answers, and the scores of the default recipe on them."""
 
+from pirl_rl.scoring.alternatives import Alternative, play_rival, race_grid
 from pirl_rl.scoring.score import Score, measure
 from pirl_rl.scoring.table import markdown
 from pirl_rl.scoring.truth import Truth, find_truth
 
-__all__ = ["PROBLEMS", "Score", "Truth", "find_truth", "markdown", "measure"]
+__all__ = [
+    "PROBLEMS",
+    "Alternative",
+    "Score",
+    "Truth",
+    "find_truth",
+    "markdown",
+    "measure",
+    "play_rival",
+    "race_grid",
+]
 
 PROBLEMS: dict[str, tuple[str, ...]] = {
     "reach1d": ("+experiment=reach1d",),

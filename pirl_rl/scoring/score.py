@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from pirl_rl.evaluation.monte_carlo import mean_payoff
+from pirl_rl.evaluation.monte_carlo import Policy, mean_payoff
 from pirl_rl.scoring.truth import Truth
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
@@ -69,9 +69,7 @@ def measure(
     """
 
     def played(index: torch.Tensor, count: int, seed: int) -> torch.Tensor:
-        rng = torch.Generator().manual_seed(seed)
-        tau, x = truth.tau[index].to(solution.dtype), truth.x[index].to(solution.dtype)
-        return mean_payoff(simulator, solution.policy, tau, x, count, rng)
+        return successes(simulator, solution.policy, truth, index, count, seed)
 
     everything = torch.arange(len(truth.tau))
     success, value = played(everything, rollouts, seed), solution.value(truth.tau, truth.x).double()
@@ -97,3 +95,11 @@ def measure(
         seconds=seconds,
         updates=updates,
     )
+
+
+def successes(
+    simulator: Simulator, policy: Policy, truth: Truth, index: torch.Tensor, rollouts: int, seed: int = 1
+) -> torch.Tensor:
+    """The success (K,) of a policy, by Monte Carlo, at the states of a truth with the given indices (K,)."""
+    dtype, rng = torch.get_default_dtype(), torch.Generator().manual_seed(seed)
+    return mean_payoff(simulator, policy, truth.tau[index].to(dtype), truth.x[index].to(dtype), rollouts, rng)
