@@ -29,6 +29,12 @@ from pirl_rl.solution import Solution
 
 TD_CRITERIA = ("squares", "cross_entropy")
 
+LARGEST_LOGIT = 10.0
+"""Logits of V beyond this, at which V is 5e-5 away from 0 or 1, are held back."""
+
+LOGIT_WEIGHT = 0.1
+"""The weight of the square of what a logit exceeds that by."""
+
 _cross_entropy = nn.functional.binary_cross_entropy_with_logits
 
 
@@ -231,8 +237,10 @@ class PIRLLoss(ScheduledTD3Loss):
             else:
                 # Targets may lie outside [0, 1] by a control variate. The loss is linear in them, so that their mean
                 # counts, and from the logits it has a gradient where the output is rounded to 0 or 1.
+                # Without a bound a network that tells single targets apart would follow them to infinity.
                 logits = critic.logits(*inputs)
                 error = _cross_entropy(logits, target.expand_as(logits), reduction="none")
+                error = error + LOGIT_WEIGHT * (logits.abs() - LARGEST_LOGIT).clamp(min=0).square()
         return error.squeeze(-1).sum(0).mean()
 
     def _hjb_loss(self, points: TensorDictBase) -> Tensor:

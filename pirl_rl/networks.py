@@ -110,7 +110,9 @@ def _spread(layers: nn.Sequential, spread: float | None, problem: ReachAvoidProb
     """Spread the zeros of the first hidden layer over the box of the inputs; nothing happens without a spread.
 
     By the usual initialisation all zeros pass near the middle of the box, and training has to move them first. In few
-    dimensions, where V has kinks and layers in many places, that takes most of the updates.
+    dimensions, where V has kinks and layers in many places, that takes most of the updates. Of n > 2 states each has
+    2/n of the weight of the other inputs: time and levels would otherwise be lost among many states, along a single
+    one of which V changes little.
 
     Raises:
         ArgumentError: `spread` is not positive.
@@ -121,12 +123,15 @@ def _spread(layers: nn.Sequential, spread: float | None, problem: ReachAvoidProb
         raise ArgumentError(f"spread: expected a number > 0, or None, got {spread}")
     first = next(index for index, layer in enumerate(layers) if isinstance(layer, Dense))
     dense: Dense = layers[first]  # type: ignore[assignment]
-    count, slope = dense.out_features, spread * (3 / (problem.states.dim + 1)) ** 0.5
+    count, states = dense.out_features, problem.states.dim
     tau, action = problem.horizon * torch.rand(count, 1), 2 * torch.rand(count, controls) - 1
     with torch.no_grad():
         through = layers[:first](torch.cat([tau, problem.states.sample(count), action], -1))
-        direction = nn.functional.normalize(torch.randn_like(dense.weight), dim=-1)
-        dense.weight.copy_(2 * slope * torch.rand(count, 1) * direction)
+        direction = torch.randn_like(dense.weight)
+        # The time to go is the first input, the states follow, and the cosines of periodic ones are the last.
+        cosines = range(direction.shape[-1] - len(problem.states.periodic), direction.shape[-1])
+        direction[:, [*range(1, 1 + states), *cosines]] *= min(1.0, 2 / states)
+        dense.weight.copy_(2 * spread * torch.rand(count, 1) * nn.functional.normalize(direction, dim=-1))
         dense.bias.copy_(-(dense.weight * through).sum(-1))
 
 
@@ -140,10 +145,9 @@ class Actor(nn.Module):
         scaling: box of states that the first layer maps to [-1, 1]^n; default `problem.states`, which gives the periods
             of periodic axes in any case.
         root_time: whether sqrt(tau) is an input beside tau, see `RootTime`.
-        spread: the mean slope of the neurons of the first layer in the scaled inputs, for two states. For n states it
-            is sqrt(3/(n + 1)) times that, so that V does not vary faster over the box of more dimensions. Their zeros
-            then pass through points that are uniform in the box. None takes the usual initialisation, for which
-            all zeros pass near the middle of the box.
+        spread: the mean slope of the neurons of the first layer in the scaled inputs. Their zeros then pass through
+            points that are uniform in the box. None takes the usual initialisation, for which all zeros pass near the
+            middle of the box.
         levels: whether the levels of the constraints of A and B are inputs too, see `Levels`.
 
     Raises:
@@ -186,10 +190,9 @@ class Critic(nn.Module):
             infinite weights. None is a linear output, which attains both.
         scaling: box of states that the first layer maps to [-1, 1]^n; default `problem.states`, which gives the periods
             of periodic axes in any case.
-        spread: the mean slope of the neurons of the first layer in the scaled inputs, for two states. For n states it
-            is sqrt(3/(n + 1)) times that, so that V does not vary faster over the box of more dimensions. Their zeros
-            then pass through points that are uniform in the box. None takes the usual initialisation, for which
-            all zeros pass near the middle of the box.
+        spread: the mean slope of the neurons of the first layer in the scaled inputs. Their zeros then pass through
+            points that are uniform in the box. None takes the usual initialisation, for which all zeros pass near the
+            middle of the box.
         levels: whether the levels of the constraints of A and B are inputs too, see `Levels`.
 
     Raises:

@@ -27,8 +27,7 @@ def test_zeros_of_spread_neurons_pass_through_the_box(problem):
     torch.manual_seed(0)
     for network in networks(problem, root_time=True, spread=3.0):
         dense = first_dense(network)
-        # The slope falls with the number of states, so that V does not vary faster in more dimensions.
-        slope = dense.weight.norm(dim=-1) * ((problem.states.dim + 1) / 3) ** 0.5
+        slope = dense.weight.norm(dim=-1)
         # 2 * 3 * U with U uniform: the mean is 3, and its standard error 3 / sqrt(3 * 512).
         assert slope.max() <= 6 + 1e-5
         assert abs(slope.mean().item() - 3) < 4 * 3 / (3 * WIDTH) ** 0.5
@@ -37,6 +36,10 @@ def test_zeros_of_spread_neurons_pass_through_the_box(problem):
         # The distances of the planes from the middle spread over the box: U has the standard deviation 1/sqrt(3).
         distance = dense.bias / dense.weight.norm(dim=-1)
         assert abs(distance.std().item() * 3**0.5 - 1) < 0.15
+        # Each of n > 2 states has 2/n of the weight of time and its root; in the mean of logarithms no norm counts.
+        weight, n = dense.weight.abs().log().mean(0), problem.states.dim
+        share = (weight[1 : 1 + n].mean() - torch.cat([weight[:1], weight[1 + n :]]).mean()).exp()
+        assert share.item() == pytest.approx(2 / n, rel=0.1)
 
 
 def test_the_zeros_of_a_periodic_coordinate_lie_on_its_circle():

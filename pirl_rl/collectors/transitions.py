@@ -28,6 +28,9 @@ from pirl_rl.solution import Solution
 TRANSITION = ("tau", "state", "action", "loc", *(("next", key) for key in ("tau", "state", "reward", "terminated")))
 """The entries of a transition that the loss reads; "loc" is the output of the actor, "action" the played action."""
 
+LEAST_DEVIATION = 1e-6
+"""A deviation of V in one step that is always allowed, so that nothing is divided by zero where V is 0 or 1."""
+
 
 class Exploration(nn.Module):
     """Adds clipped Gaussian noise to actions in [-1, 1].
@@ -62,13 +65,14 @@ class ControlVariate(nn.Module):
 
     A slope that is too steep adds noise in place of taking it out, and in many dimensions V would learn ever steeper
     slopes from such returns. So the slope is shortened where the deviation |sigma^T grad V| sqrt(dt) of V in one step
-    exceeds a limit. The factor is known before the step, so that the means of the returns stay as they are.
+    exceeds a share of 2 sqrt(V (1 - V)): V is a martingale between 0 and 1, and near these bounds it moves little. The
+    factor is known before the step, so that the means of the returns stay as they are.
 
     Args:
         solution: gives V, the mean of its critics.
         simulator: gives sigma and the length of a control step.
         compile: whether the slope is compiled. Where that fails, it runs eagerly after one warning.
-        limit: the largest deviation of V in one step, > 0.
+        limit: the largest deviation of V in one step where V = 1/2, > 0.
 
     Raises:
         ArgumentError: `limit` is not positive.
@@ -90,10 +94,16 @@ class ControlVariate(nn.Module):
 
     def _slope(self, tau: Tensor, state: Tensor, action: Tensor) -> Tensor:
         value, problem = self.critic.at(action), self.simulator.problem
-        slope = torch.func.grad(lambda x: value(tau.squeeze(-1), x).mean(0).sum())(state)
+
+        def summed(x: Tensor) -> tuple[Tensor, Tensor]:
+            v = value(tau.squeeze(-1), x).mean(0)
+            return v.sum(), v
+
+        slope, v = torch.func.grad(summed, has_aux=True)(state)
         sigma = problem.diffusion(state, problem.controls.denormalize(action))
-        deviation = transposed_times(sigma, slope).norm(dim=-1, keepdim=True) * self.simulator.dt**0.5
-        return slope * (self.limit / deviation.clamp(min=self.limit))
+        deviation = transposed_times(sigma, slope).norm(dim=-1) * self.simulator.dt**0.5
+        bound = (2 * self.limit * (v * (1 - v)).clamp(min=0).sqrt()).clamp(min=LEAST_DEVIATION)
+        return slope * (bound / torch.maximum(deviation, bound)).unsqueeze(-1)
 
 
 def exploring_policy(
