@@ -25,6 +25,9 @@ from pirl_rl.time_steps import propose_time_steps
 from pirl_rl.trainer import Trainer
 
 AUTO = "auto"
+
+UPDATES, MORE_UPDATES = 12_000, 20_000
+"""The updates of a run whose configuration leaves them open, with up to three states and with more."""
 """The value of env.dt and env.substeps that leaves the choice to `propose_time_steps`."""
 
 
@@ -78,7 +81,7 @@ def make_trainer(
     """Build the trainer of a configuration with all its parts; nothing is written yet.
 
     Args:
-        config: the configuration of a run; a time step that is `auto` is replaced by the number that is chosen for it.
+        config: the configuration of a run; time steps and updates that are `auto` are replaced by the chosen numbers.
         folder: the run directory; None keeps everything in memory.
         trust: modules outside the package that the configuration may name.
         problem: replaces `env.problem`.
@@ -95,6 +98,7 @@ def make_trainer(
     torch.manual_seed(networks)
     problem = make_problem(config, trust) if problem is None else problem
     choose_time_steps(config, problem)
+    choose_updates(config, problem)
     supplied = {"problem": problem, "seed": physics, "device": device, "compile_simulator": config.compile}
     env: ReachAvoidEnv = build(_without_problem(config), "env", trust, **supplied)
     parts = {"problem": problem, "simulator": env.simulator}
@@ -143,6 +147,12 @@ def choose_time_steps(config: DictConfig, problem: ReachAvoidProblem) -> None:
     chosen = propose_time_steps(problem, **given)
     config.env.dt, config.env.substeps = chosen.dt, chosen.substeps
     print(f"time: {chosen.reason}", flush=True)
+
+
+def choose_updates(config: DictConfig, problem: ReachAvoidProblem) -> None:
+    """Replace `auto` in trainer.updates by a number, `UPDATES`, or with more than three states `MORE_UPDATES`."""
+    if config.trainer.get("updates") == AUTO:
+        config.trainer.updates = UPDATES if problem.states.dim <= 3 else MORE_UPDATES
 
 
 def _without_problem(config: DictConfig) -> DictConfig:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import asdict
 
 import pytest
 import torch
 
 from pirl_rl.commands.suite import main
+from pirl_rl.figures import draw_suite
 from pirl_rl.problems import CartPole, Exit1D, Pendulum, Reach1D
 from pirl_rl.scoring import PROBLEMS, Score, Truth, find_truth, markdown, measure
 from pirl_rl.simulator import Simulator
@@ -112,6 +114,8 @@ def test_the_command_goes_on_where_it_stopped(tmp_path, capsys, monkeypatch):
     [
         (["problems=[nowhere]"], "problems: expected names out of reach1d, .* got 'nowhere'"),
         (["seeds=3"], "seeds: expected a list"),
+        (["problems=[exit1d]", "against=[mpc]"], "against: expected names out of grid, lqr, ppo, sac, got 'mpc'"),
+        (["problems=[exit1d]", "patience=0"], "patience: expected a number > 0, got 0"),
         (["problems=[exit1d]", "rollouts=0"], "rollouts: expected integers >= 1, got 0"),
         (["problems=[exit1d]", "trainer.update=3"], "update"),
     ],
@@ -122,3 +126,26 @@ def test_mistakes_are_named(arguments, message, tmp_path, capsys, monkeypatch):
         main(arguments)
     assert re.search(message, capsys.readouterr().err)
     assert not any(tmp_path.iterdir())
+
+
+def test_alternatives_stand_in_the_table_and_are_kept(tmp_path, capsys, monkeypatch):
+    """The grid is timed, the regulator is played, and neither is repeated by a second call."""
+    monkeypatch.chdir(tmp_path)
+    asked = ["problems=[double_integrator]", "states=30", "rollouts=10", "+debug=default", "evaluation.final=[]"]
+    monkeypatch.setattr("pirl_rl.scoring.truth.GRID_POINTS", {2: 41})
+    monkeypatch.setattr("pirl_rl.scoring.alternatives.GRID_POINTS", {2: 41})
+    main([*asked, "against=[grid,lqr]"])
+    table = (tmp_path / "runs/suite/suite.md").read_text().splitlines()
+    assert table[0].endswith("| Time of the grid | Success of LQR |")
+    found = json.loads((tmp_path / "runs/suite/double_integrator/lqr.json").read_text())
+    assert table[2].endswith(f"| {found['success']:.3f} |")
+    assert 0 < found["success"] <= 1
+    assert re.search(r"\| \d+\.\d s \|", table[2])
+    capsys.readouterr()
+    main([*asked, "against=[grid,lqr]"])
+    assert "double_integrator: lqr" not in capsys.readouterr().out
+
+
+def test_a_figure_of_problems_without_a_truth():
+    score = Score(*[math.nan] * 3, 0.5, math.nan, 0.01, math.nan, 0.02, 0.01, 60.0, 12_000)
+    assert len(draw_suite({"cartpole": [asdict(score)]}).axes) == 4

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pirl_rl.assembly import choose_time_steps, make_trainer
+from pirl_rl.assembly import choose_time_steps, choose_updates, make_problem, make_trainer
 from pirl_rl.commands.composition import compose
 from pirl_rl.configuration import load_config, save_config
 from pirl_rl.errors import ArgumentError, ConfigError
@@ -224,3 +224,13 @@ def test_a_number_beside_auto_is_kept(capsys):
     assert capsys.readouterr().out == ""
     with pytest.raises(ConfigError, match=r"env\.dt: expected float, got 'soon'"):
         choose_time_steps(own("env.dt=soon"), Safety1D())
+
+
+@pytest.mark.parametrize(("experiment", "updates"), [("reach1d", 12_000), ("cartpole", 20_000)])
+def test_the_length_of_a_run_follows_the_number_of_states(experiment, updates):
+    config = compose("train", [f"+experiment={experiment}"])
+    choose_updates(config, make_problem(config))
+    assert config.trainer.updates == updates
+    config = compose("train", [f"+experiment={experiment}", "trainer.updates=7"])
+    choose_updates(config, make_problem(config))
+    assert config.trainer.updates == 7

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -22,7 +22,7 @@ class ActorRule(ABC):
             compiles the body of the loop in `compile`.
     """
 
-    compiles_whole: ClassVar[bool] = True
+    compiles_whole: bool = True
 
     @abstractmethod
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
