@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable
 from typing import Any
 
 import torch
 
+FRAME = re.compile(r'File "(.+)", line (\d+)')
+"""A place in the code, in the messages of the compiler."""
 
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+
+def compiled(function: Callable[..., Any], whole: bool = False) -> Callable[..., Any]:
     """The function, compiled at its first call for the shapes that it gets.
 
     Each result has programs of its own: trainings of many problems in one process would otherwise share, and exhaust,
     the small number that the compiler keeps for one function. Shapes are constants, because derivatives of the physics
     in forward mode do not compile for others.
+
+    Args:
+        function: maps tensors to tensors.
+        whole: whether a function that cannot be compiled as one program is an error. Otherwise it becomes many small
+            ones, which together may be slower than none.
     """
-    # PyTorch's own overloads lack the second argument.
-    return torch.compile(function, dynamic=False, isolate_recompiles=True)  # pyright: ignore[reportCallIssue]
+    # PyTorch's own overloads lack the last argument.
+    return torch.compile(function, fullgraph=whole, dynamic=False, isolate_recompiles=True)  # pyright: ignore
 
 
 class Compiled:
@@ -30,7 +39,7 @@ class Compiled:
 
     def __init__(self, function: Callable[..., Any], name: str):
         self.function, self.name = function, name
-        self._called: Callable[..., Any] = compiled(function)
+        self._called: Callable[..., Any] = compiled(function, whole=True)
 
     def __call__(self, *args: Any) -> Any:
         try:
@@ -38,8 +47,7 @@ class Compiled:
         except Exception as error:
             if self._called is self.function or not is_compiler_failure(error):
                 raise
-            reason = str(error).partition("\n")[0]
-            warnings.warn(f"{self.name} runs eagerly, which is slower: {reason}", stacklevel=2)
+            warnings.warn(f"{self.name} runs eagerly, which is slower: {reason_of(error)}", stacklevel=2)
             self._called = self.function
             return self.function(*args)
 
@@ -51,3 +59,10 @@ def is_compiler_failure(error: Exception) -> bool:
     from torch._inductor.exc import InductorError
 
     return isinstance(error, (TorchDynamoException, InductorError))
+
+
+def reason_of(error: Exception) -> str:
+    """What the compiler could not do, and the line of code, in one line."""
+    text = str(error)
+    places = FRAME.findall(text)
+    return text.partition("\n")[0] + (f" ({places[-1][0]}, line {places[-1][1]})" if places else "")

@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import SoftUpdate
 
-from pirl_rl.compilation import compiled, is_compiler_failure
+from pirl_rl.compilation import compiled, is_compiler_failure, reason_of
 from pirl_rl.curriculum import StageSettings
 from pirl_rl.errors import ArgumentError, DivergenceError
 from pirl_rl.losses import PIRLLoss
@@ -171,8 +171,7 @@ class Learner:
             self.compile = False
             self._compile_critic_loss()
             self._compile_actor_loss()
-            reason = str(error).partition("\n")[0]
-            warnings.warn(f"updates run eagerly, about half as fast: {reason}", stacklevel=3)
+            warnings.warn(f"updates run eagerly, about half as fast: {reason_of(error)}", stacklevel=3)
             return evaluate()
 
     @staticmethod

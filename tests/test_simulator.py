@@ -275,3 +275,17 @@ def test_a_compiled_simulator_draws_the_same_random_numbers(problem, monkeypatch
     assert torch.equal(compiled.reached, eager.reached)
     assert torch.equal(compiled.failed, eager.failed)
     assert (eager.reached | eager.failed).any()
+
+
+def test_physics_that_cannot_be_compiled_run_eagerly_and_the_line_is_named():
+    class Branching(Reach1D):
+        def drift(self, x, u):
+            return u if x.sum().item() > 0 else 1.0 * u
+
+    x, u = torch.full((5, 1), 0.5), torch.zeros(5, 1)
+    simulator = Simulator(Branching(), 0.1, compile=True)
+    with pytest.warns(
+        UserWarning, match=r"the simulator runs eagerly, which is slower: .*test_simulator\.py, line \d+"
+    ):
+        step = simulator.step(x, u, torch.Generator().manual_seed(0))
+    assert torch.equal(step.state, Simulator(Branching(), 0.1).step(x, u, torch.Generator().manual_seed(0)).state)

@@ -50,6 +50,7 @@ class VehicleDrift3(ReachAvoidProblem):
         super().__init__(payoff, horizon)
         self.friction = float(friction)
         self.equilibrium = equilibrium(self)
+        self._middle = tuple(self.equilibrium[0].tolist())
 
     def drift(self, x: Tensor, u: Tensor) -> Tensor:
         """f (*, 3), in units of the state per s. As in the article, F_yf enters v_y' and r' without cos(delta)."""
@@ -74,7 +75,7 @@ class VehicleDrift3(ReachAvoidProblem):
         return columns.expand(*x.shape, 3)
 
     def target_constraints(self, x: Tensor) -> Tensor:
-        coordinates = zip(x.unbind(-1), self.equilibrium[0].tolist(), self.tolerances.values(), strict=True)
+        coordinates = zip(x.unbind(-1), self._middle, self.tolerances.values(), strict=True)
         return torch.stack([band(*coordinate) for coordinate in coordinates]).movedim(0, -1)
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
