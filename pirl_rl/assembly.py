@@ -26,8 +26,8 @@ from pirl_rl.trainer import Trainer
 
 AUTO = "auto"
 
-UPDATES, MORE_UPDATES = 12_000, 20_000
-"""The updates of a run whose configuration leaves them open, with up to three states and with more."""
+UPDATES_PER_DIMENSION, MOST_UPDATES = 4_000, 20_000
+"""The updates of a run whose configuration leaves them open: for each dimension of (tau, x), and at most."""
 """The value of env.dt and env.substeps that leaves the choice to `propose_time_steps`."""
 
 
@@ -150,9 +150,9 @@ def choose_time_steps(config: DictConfig, problem: ReachAvoidProblem) -> None:
 
 
 def choose_updates(config: DictConfig, problem: ReachAvoidProblem) -> None:
-    """Replace `auto` in trainer.updates by a number, `UPDATES`, or with more than three states `MORE_UPDATES`."""
+    """Replace `auto` in trainer.updates by a number, which grows with the dimensions of V(tau, x) up to a limit."""
     if config.trainer.get("updates") == AUTO:
-        config.trainer.updates = UPDATES if problem.states.dim <= 3 else MORE_UPDATES
+        config.trainer.updates = min(UPDATES_PER_DIMENSION * (problem.states.dim + 1), MOST_UPDATES)
 
 
 def _without_problem(config: DictConfig) -> DictConfig:
