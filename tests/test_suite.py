@@ -101,6 +101,7 @@ def test_the_command_goes_on_where_it_stopped(tmp_path, capsys, monkeypatch):
     assert first["updates"] == 20
     assert (tmp_path / "runs/suite/suite.png").is_file()
     capsys.readouterr()
+    (tmp_path / "runs/suite/exit1d/4/checkpoints").mkdir(parents=True)  # a run that was killed early
     main([*SMALL, "seeds=[3,4]"])
     assert json.loads((tmp_path / "runs/suite/exit1d/3/score.json").read_text()) == first
     printed = capsys.readouterr().out

@@ -17,6 +17,7 @@ the folder `out` is not repeated, so that a suite that was stopped goes on. Sett
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -151,6 +152,8 @@ def _score(folder: Path, name: str, overrides: Sequence[str], truth: Truth, roll
         if run.last.is_file():
             resume(folder, [])
         else:
+            # A run that was killed before its first checkpoint has nothing to go on from.
+            shutil.rmtree(folder, ignore_errors=True)
             train_new(compose("train", typed), folder, typed)
     summary = json.loads(run.summary.read_text(encoding="utf-8"))
     trained = load_run(folder, trust=load_config(folder).trust)
