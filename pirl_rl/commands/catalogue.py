@@ -14,6 +14,7 @@ COMMANDS = (
         "train; settings follow as key=value, and -m sweeps over several values",
     ),
     ("python -m pirl_rl.train +experiment=own env.problem._target_=my_module.MyProblem", "train on your own problem"),
+    ("python -m pirl_rl.train +experiment=zermelo method=grid", "solve a problem of up to three states on a grid"),
     ("python -m pirl_rl.train resume=RUN_DIR", "resume a run"),
     ("python -m pirl_rl.train +experiment=reach1d start=RUN_DIR", "start a new run with the networks of another run"),
     ("python -m pirl_rl.train +experiment=reach1d --cfg job", "show all settings"),
@@ -22,6 +23,7 @@ COMMANDS = (
     ("python -m pirl_rl.export run=RUN_DIR out=FOLDER", "copy the networks and the results of a run"),
     ("python -m pirl_rl.compare RUN_DIRS", "compare runs in one table and one figure"),
     ("python -m pirl_rl.sweeps DIR", "draw a table and a heat map of a sweep"),
+    ("python -m pirl_rl.suite", "train the problems of the suite and compare them with known answers"),
 )
 GROUPS = {
     "experiment": "experiments, +experiment=NAME",
