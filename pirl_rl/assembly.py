@@ -26,7 +26,7 @@ from pirl_rl.trainer import Trainer
 
 AUTO = "auto"
 
-UPDATES_PER_DIMENSION, MOST_UPDATES = 4_000, 20_000
+UPDATES_PER_DIMENSION, MOST_UPDATES = 5_000, 20_000
 """The updates of a run whose configuration leaves them open: for each dimension of (tau, x), and at most."""
 """The value of env.dt and env.substeps that leaves the choice to `propose_time_steps`."""
 

@@ -21,7 +21,7 @@ from pirl_rl.simulator import Simulator
 SHARES = {"the box": (0.05, 0.1), "the target": (0.5, 0.5), "the avoid set": (0.5, 0.5)}
 """The largest moves of drift and noise in one control step, in widths of the box and depths of the sets."""
 
-STEPS = (200, 250, 300, 400)
+STEPS = (400, 500, 600, 800)
 """The numbers of control steps in the horizon from which one is taken."""
 
 TOLERANCE = 1e-3
@@ -30,8 +30,8 @@ TOLERANCE = 1e-3
 COVERED = 0.95
 """The share of the sampled states at which the error is below the tolerance."""
 
-LEAST_SUBSTEPS, MOST_SUBSTEPS = 4, 256
-"""The range of the number of sub-steps that are proposed. Fewer than four bias V near corners of the sets."""
+LEAST_SUBSTEPS, MOST_SUBSTEPS = 2, 256
+"""The range of the number of sub-steps that are proposed. One biases V near corners of the sets."""
 
 
 class TimeSteps(NamedTuple):
