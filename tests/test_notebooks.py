@@ -16,7 +16,8 @@ MODEL = ROOT / "models" / "drift"
 SHORT = {
     "01_quickstart": "UPDATES = 1_000\nCOMPILE = False",
     "02_drift": f"MODEL = {str(MODEL)!r}\nROLLOUTS = 200",
-    "03_schedules": "UPDATES, ROUNDS, CANDIDATES = 100, 1, 1\nSETTINGS = '+experiment=reach1d compile=false pirl.final=[1,1,10]'",
+    "03_schedules": "UPDATES, ROUNDS, CANDIDATES = 100, 1, 1\n"
+    "SETTINGS = '+experiment=reach1d compile=false pirl.final=[1,1,10]'",
 }
 LIMITS = {
     "01_quickstart": {"max": 0.15},

@@ -17,6 +17,7 @@ from pirl_rl.scoring import PROBLEMS, Score, Truth, find_truth, markdown, measur
 from pirl_rl.simulator import Simulator
 
 SMALL = ["problems=[exit1d]", "states=50", "rollouts=20", "+debug=default", "evaluation.final=[]"]
+SMALL += ["env.dt=0.1", "env.substeps=1", "evaluation.during=[]"]
 
 
 class Exact:
@@ -132,7 +133,7 @@ def test_mistakes_are_named(arguments, message, tmp_path, capsys, monkeypatch):
 def test_alternatives_stand_in_the_table_and_are_kept(tmp_path, capsys, monkeypatch):
     """The grid is timed, the regulator is played, and neither is repeated by a second call."""
     monkeypatch.chdir(tmp_path)
-    asked = ["problems=[double_integrator]", "states=30", "rollouts=10", "+debug=default", "evaluation.final=[]"]
+    asked = ["problems=[double_integrator]", "states=30", "rollouts=10", *SMALL[3:]]
     monkeypatch.setattr("pirl_rl.scoring.truth.GRID_POINTS", {2: 41})
     monkeypatch.setattr("pirl_rl.scoring.alternatives.GRID_POINTS", {2: 41})
     main([*asked, "against=[grid,lqr]"])

@@ -226,7 +226,9 @@ def test_a_number_beside_auto_is_kept(capsys):
         choose_time_steps(own("env.dt=soon"), Safety1D())
 
 
-@pytest.mark.parametrize(("experiment", "updates"), [("reach1d", 10_000), ("zermelo", 15_000), ("dubins", 20_000), ("quadrotor", 20_000)])
+@pytest.mark.parametrize(
+    ("experiment", "updates"), [("reach1d", 10_000), ("zermelo", 15_000), ("dubins", 20_000), ("quadrotor", 20_000)]
+)
 def test_the_length_of_a_run_follows_the_number_of_states(experiment, updates):
     config = compose("train", [f"+experiment={experiment}"])
     choose_updates(config, make_problem(config))

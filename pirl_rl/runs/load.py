@@ -76,8 +76,9 @@ class Run:
         Args:
             tau: times to go in s, a number or (*).
             x: states (*, n) in SI units.
-            lookahead: a number of control steps of the training, over which candidate controls are held without noise.
-                The control with the largest V at their end is taken, see `pirl_rl.ascent`; with 0, the actor's is.
+            lookahead: a number of control steps of the training without noise, the first with a candidate control and
+                the others with the actor's. The candidate with the largest V at their end is taken, see
+                `pirl_rl.ascent`; with 0, the actor's control is.
             levels: each coordinate of the control has this many candidates, evenly spaced over its range.
         """
         if not (isinstance(lookahead, int) and lookahead >= 0 and isinstance(levels, int) and levels >= 2):
