@@ -1,6 +1,6 @@
 """What each part of the default recipe gives: the suite's problems without that part, or with another one.
 
-python benchmarks/recipe.py [out=runs/recipe] [problems=zermelo,pendulum] [seeds=0,1] [only=default,no levels]
+    python benchmarks/recipe.py [out=runs/recipe] [problems=zermelo,pendulum] [seeds=0,1] ['only=default,squares']
 
 Each variant is a run of `python -m pirl_rl.suite` with other settings; a benchmark that was stopped goes on.
 """
@@ -17,21 +17,21 @@ STATES = "collector.initial_states"
 
 VARIANTS: dict[str, list[str]] = {
     "default": [],
-    "no levels of the sets as inputs": ["actor.levels=false", "critic.levels=false"],
+    "no levels": ["actor.levels=false", "critic.levels=false"],
     "no control variate": ["collector.control_variate=null"],
-    "no starts near faces": [f"{STATES}.share=0"],
-    "no spread of the first layer": ["actor.spread=null", "critic.spread=null"],
-    "actor that ascends the Hamiltonian": ["pirl.actor_rule={_target_:pirl_rl.actor_rules.Hamiltonian}"],
-    "no last stage with a fixed actor": ["pirl.stages=[]"],
-    "squares in place of cross-entropy": ["pirl.td_criterion=squares"],
-    "whole episodes as returns": ["pirl.n_steps=200"],
+    "no faces": [f"{STATES}.share=0"],
+    "no spread": ["actor.spread=null", "critic.spread=null"],
+    "ascent of the Hamiltonian": ["pirl.actor_rule={_target_:pirl_rl.actor_rules.Hamiltonian}"],
+    "no last stage": ["pirl.stages=[]"],
+    "squares": ["pirl.td_criterion=squares"],
+    "whole episodes as returns": ["pirl.n_steps=400"],
     "returns of five steps": ["pirl.n_steps=5"],
-    "residual and boundary, 1 and 10": ["pirl.final=[1,1,10]", "schedule.center=0.2", "schedule.steepness=30"],
-    "residual, 0.03": ["pirl.final=[1,0.03,0]", "schedule.center=0.3", "schedule.steepness=30"],
-    "half the updates": ["trainer.updates=6000"],
-    "twice the updates": ["trainer.updates=24000"],
+    "residual 1 and boundary 10": ["pirl.final=[1,1,10]", "schedule.center=0.2", "schedule.steepness=30"],
+    "residual 0.03": ["pirl.final=[1,0.03,0]", "schedule.center=0.3", "schedule.steepness=30"],
+    "6000 updates": ["trainer.updates=6000"],
+    "30000 updates": ["trainer.updates=30000"],
 }
-"""The settings of each variant."""
+"""The settings of each variant, by a name without commas."""
 
 
 def main() -> None:
@@ -41,7 +41,7 @@ def main() -> None:
     chosen = given["only"].split(",") if "only" in given else [*VARIANTS]
     rows = []
     for variant in chosen:
-        folder = out / variant.replace(" ", "_").replace(",", "")
+        folder = out / variant.replace(" ", "_")
         common = [f"out={folder}", f"seeds=[{','.join(seeds)}]", "evaluation.during=[]", "evaluation.final=[]"]
         suite([*common, f"problems=[{','.join(problems)}]", *VARIANTS[variant]])
         rows.append(f"| {variant} | {' | '.join(_cell(folder / name, seeds) for name in problems)} |")

@@ -25,10 +25,10 @@ from pirl_rl.time_steps import propose_time_steps
 from pirl_rl.trainer import Trainer
 
 AUTO = "auto"
+"""The value of env.dt, env.substeps and trainer.updates that leaves the choice to the package."""
 
 UPDATES_PER_DIMENSION, MOST_UPDATES = 5_000, 20_000
-"""The updates of a run whose configuration leaves them open: for each dimension of (tau, x), and at most."""
-"""The value of env.dt and env.substeps that leaves the choice to `propose_time_steps`."""
+"""The number of updates that is chosen for each dimension of (tau, x), and the largest that is chosen."""
 
 
 def pick_device(name: str) -> torch.device:

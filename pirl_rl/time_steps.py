@@ -31,7 +31,7 @@ COVERED = 0.95
 """The share of the sampled states at which the error is below the tolerance."""
 
 LEAST_SUBSTEPS, MOST_SUBSTEPS = 2, 256
-"""The range of the number of sub-steps that are proposed. One biases V near corners of the sets."""
+"""The range of the number of sub-steps that are proposed. A single sub-step biases V near corners of the sets."""
 
 
 class TimeSteps(NamedTuple):

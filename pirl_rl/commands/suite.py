@@ -168,9 +168,12 @@ def _score(folder: Path, name: str, overrides: Sequence[str], truth: Truth, roll
 def _alternative(
     folder: Path, other: str, scores: Sequence[Score], truth: Truth, options: dict[str, Any]
 ) -> Alternative | None:
-    """An alternative at the states of the truth, from its file if it is there; None where it does not suit."""
+    """An alternative at the states of the truth, from its file if it is there; None where it does not suit.
+
+    The grid is timed anew, because its goal is the error of the worst run, which changes with the seeds.
+    """
     path = folder / f"{other}.json"
-    if path.is_file():
+    if path.is_file() and other != "grid":
         found = json.loads(path.read_text(encoding="utf-8"))
         return None if found is None else Alternative(**found)
     trained = load_run(folder / str(options["seeds"][0]), trust=load_config(folder / str(options["seeds"][0])).trust)
