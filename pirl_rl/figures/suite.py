@@ -32,6 +32,8 @@ def draw_suite(scores: Mapping[str, Sequence[Mapping[str, float]]]) -> Figure:
         _draw_problems(panel, {name: [run[key] for run in runs] for name, runs in scores.items()})
         panel.set_xlabel(label)
         panel.tick_params(axis="y", labelleft=panel is panels[0])
+    for panel in panels[1:-1]:
+        panel.locator_params(axis="x", nbins=4)
     if any(run["mse"] > 0 for runs in scores.values() for run in runs):
         panels[0].set_xscale("log")
     _draw_times(panels[-1], scores)
