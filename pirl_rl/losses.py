@@ -45,7 +45,7 @@ class PIRLLoss(ScheduledTD3Loss):
 
     - "replay": N transitions with "tau" (N, 1), "state" (N, n), "action" (N, m) and, for the TD term, "next";
     - "collocation": "tau" (N, 1), "state" (N, n) and "mask" (N,), for the HJB term;
-    - "boundary": "tau" (N, 1), "state" (N, n) and "value" (N,), for the boundary term.
+    - "boundary": "tau" (N, 1), "state" (N, n), "value" (N,) and "weight" (N,), for the boundary term.
 
     It returns the scalars "loss_qvalue" and "loss_actor", for the two optimisers, and the unweighted "td_loss",
     "hjb_loss" and "boundary_loss", which are sums over the critics.
@@ -255,12 +255,12 @@ class PIRLLoss(ScheduledTD3Loss):
         return masked_mean(squares.sum(0), points["mask"])
 
     def _boundary_loss(self, points: TensorDictBase) -> Tensor:
-        """L_BC summed over critics: the mean of (Q_i(y, pi^-(y)) - l_eps)^2."""
+        """L_BC summed over critics: the mean of w (Q_i(y, pi^-(y)) - l_eps)^2 with the weights w of the points."""
         with torch.no_grad():
             action = self._act(points["tau"], points["state"], target=True)
         with self._critics() as critic:
             value = critic(points["tau"], points["state"], action).squeeze(-1)
-        return _huber(value - points["value"], self.boundary_delta).sum(0).mean()
+        return (points["weight"] * _huber(value - points["value"], self.boundary_delta).sum(0)).mean()
 
     @staticmethod
     def _clipped_noise(like: Tensor, deviation: float, bound: float) -> Tensor:

@@ -145,6 +145,7 @@ def make_batch(problem: ReachAvoidProblem, count: int = 24) -> TensorDict:
     }
     collocation = {"tau": inside[0].unsqueeze(-1), "state": inside[1], "mask": torch.arange(count) % 3 > 0}
     boundary = {"tau": edge[0].unsqueeze(-1), "state": edge[1], "value": torch.rand(count, generator=rng)}
+    boundary["weight"] = torch.rand(count, generator=rng)
     parts = {"replay": replay, "collocation": collocation, "boundary": boundary}
     return TensorDict({key: TensorDict(part, batch_size=[count]) for key, part in parts.items()})
 

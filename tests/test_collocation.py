@@ -136,6 +136,53 @@ def test_sizes_add_up_and_draws_differ():
     assert torch.equal(first["state"], sampler.sample(make_rng())["state"])
 
 
+class Current(Reach1D):
+    """dX = (u + current) dt + deviation dW in the box [-2, 2]: reach 2 before -2."""
+
+    def __init__(self, current, deviation):
+        super().__init__()
+        self.current, self.deviation = current, deviation
+
+    def drift(self, x, u):
+        return u + self.current
+
+    def diffusion(self, x, u):
+        return self.deviation * torch.ones_like(x).unsqueeze(-1)
+
+    def avoid_level(self, x):
+        return x[..., 0] + 2.0
+
+
+@pytest.mark.parametrize(
+    ("current", "deviation", "at_target", "at_avoid_set"),
+    [
+        # Up to speed 1 to the right at both faces: the layer at -2 is deviation^2 / 2, in a box of half width 2.
+        (0.0, 0.2, 1.0, 0.02 / 2 / 0.05),
+        (0.0, 1.0, 1.0, 1.0),
+        # The best control still goes to the left, and crosses the face of the avoid set but not that of the target.
+        (-1.5, 0.1, 0.01 / (2 * 0.5) / 2 / 0.05, 1.0),
+        # Without noise nothing comes back to a face that paths leave.
+        (0.0, 0.0, 1.0, 0.0),
+    ],
+)
+def test_data_on_a_face_count_as_far_as_a_network_resolves_the_layer_there(current, deviation, at_target, at_avoid_set):
+    points = BoundarySampler(Current(current, deviation), initial=10, faces=200).sample(make_rng())
+    late, value, weight = points["tau"][:, 0] > 0, points["value"], points["weight"]
+    assert (weight[~late] == 1).all()
+    assert weight[late & (value == 1)].tolist() == pytest.approx([at_target] * int((late & (value == 1)).sum()))
+    assert weight[late & (value == 0)].tolist() == pytest.approx([at_avoid_set] * int((late & (value == 0)).sum()))
+
+
+def test_the_weights_of_a_box_with_several_controls_are_those_of_its_best_corner():
+    """The square of side 1 can be entered from all sides, with one control or the other."""
+    points = BoundarySampler(Corner(), initial=0, faces=500).sample(make_rng())
+    assert (points["weight"] == 1).all()
+
+
+def test_faces_that_the_problem_gives_have_weight_one():
+    assert (BoundarySampler(VehicleDrift(), initial=0, faces=500).sample(make_rng())["weight"] == 1).all()
+
+
 class Needle(Reach1D):
     """A target of a given half-width, which sampling misses; its level has a slope only outside."""
 

@@ -197,7 +197,8 @@ def test_boundary_alone_by_hand(problem):
     action = actor(edge["tau"], edge["state"]).detach()
     _, critics = networks(problem)
     by_hand = sum(
-        (critic(edge["tau"], edge["state"], action)[:, 0] - edge["value"]).square().mean() for critic in critics
+        (edge["weight"] * (critic(edge["tau"], edge["state"], action)[:, 0] - edge["value"]).square()).mean()
+        for critic in critics
     )
     ours, _ = loss.critic_loss(batch)
     assert_close([ours], [by_hand])
@@ -252,7 +253,8 @@ def test_errors_on_the_boundary_beyond_delta_count_linearly():
     values = torch.stack([critic(edge["tau"], edge["state"], action)[:, 0] for critic in critics])
     size = (values - edge["value"]).abs()
     delta = size.median().item()
-    expected = torch.where(size <= delta, size**2, 2 * delta * (size - delta / 2)).sum(0).mean()
+    errors = torch.where(size <= delta, size**2, 2 * delta * (size - delta / 2)).sum(0)
+    expected = (edge["weight"] * errors).mean()
     bounded = make_loss(problem, weights=(0.0, 0.0, 1.0), boundary_delta=delta)
     assert_close([bounded.critic_loss(batch)[0]], [expected])
 

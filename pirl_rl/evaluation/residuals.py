@@ -103,8 +103,10 @@ class Residuals:
     def _boundary(self, solution: Solution, rng: torch.Generator) -> Tensor:
         half = self.points // 2
         points = BoundarySampler(solution.problem, self.points - half, half, tau_power=1.0).sample(rng)
-        tau, x, value = like(solution, points["tau"].squeeze(-1), points["state"], points["value"])
-        return solution.raw_value(tau, x) - value
+        tau, x, value, weight = like(
+            solution, points["tau"].squeeze(-1), points["state"], points["value"], points["weight"]
+        )
+        return weight.sqrt() * (solution.raw_value(tau, x) - value)
 
     def _td(self, solution: Solution, simulator: Simulator, rng: torch.Generator) -> Tensor:
         problem = solution.problem

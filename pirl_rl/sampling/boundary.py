@@ -1,23 +1,33 @@
 """Points of the parabolic boundary, tau = 0 and the faces of A and B, with the value V of Eq. (parabolic_boundary).
 
 The number of points of a sample is fixed, so that an update has static shapes.
+
+At a face that paths cross under the best control, V has the value of the set. Where the best control leads away from
+the set with speed v > 0, V has that value in the limit only because noise of size s across the face brings some paths
+back: the one-dimensional equation v V' + s^2/2 V'' = 0 has solutions in exp(-2 v d / s^2) of the distance d. Data on a
+face whose layer s^2 / (2 v) is thinner than a network resolves would pull V down, or up, far into the interior.
 """
 
 from __future__ import annotations
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.faces import find_faces
 from pirl_rl.sampling.initial_states import sample_interior
 
+RESOLVED = 0.05
+"""The width of the thinnest layer at a face in which data have their full weight, in half widths of the box."""
+
 
 class BoundarySampler:
     """Samples points at tau = 0, and on the faces of A and B at tau in (0, T], with the value V there.
 
-    The points on the faces are drawn from a pool, see `pirl_rl.sampling.faces`.
+    The points on the faces are drawn from a pool, see `pirl_rl.sampling.faces`, and weighted, see `face_weights`. Where
+    the problem itself gives the points, `ReachAvoidProblem.faces`, all weights are 1.
 
     Args:
         problem: gives the sets and the boundary values.
@@ -55,6 +65,9 @@ class BoundarySampler:
         self.replay_share, self.box = replay_share, problem.states.expand(widen)
         rng = torch.Generator().manual_seed(seed)
         self._pool = find_faces(problem, rng)
+        points, values = self._pool.points, self._pool.values
+        given = problem.faces(1, rng) is not None
+        self._weights = torch.ones_like(values) if given else face_weights(problem, points, values)
 
     def sample(self, rng: torch.Generator, replay: TensorDictBase | None = None) -> TensorDict:
         """Draw N = initial + faces points.
@@ -64,7 +77,7 @@ class BoundarySampler:
             replay: transitions, whose "state" (k, n) are the visited states.
 
         Returns:
-            A TensorDict with "tau" (N, 1), in s, "state" (N, n) and "value" (N,).
+            A TensorDict with "tau" (N, 1), in s, "state" (N, n), "value" (N,) and "weight" (N,).
         """
         device, dtype = rng.device, torch.get_default_dtype()
         state = sample_interior(self.problem, self.box, self.initial, rng, dtype)
@@ -73,10 +86,53 @@ class BoundarySampler:
             index = torch.randint(len(replay), (visited,), generator=rng, device=device)
             state = torch.cat([replay["state"][index], state[visited:]])
         value, tau = self.problem.boundary_value(state), torch.zeros(self.initial, 1, device=device)
+        weight = torch.ones_like(value)
         if self.faces:
-            points, values = self._pool.points.to(device), self._pool.values.to(device)
+            pool = (self._pool.points, self._pool.values, self._weights)
+            points, values, weights = (entry.to(device) for entry in pool)
             index = torch.randint(len(points), (self.faces,), generator=rng, device=device)
             late = 1 - torch.rand(self.faces, 1, generator=rng, device=device)
             tau = torch.cat([tau, self.problem.horizon * late**self.tau_power])
             state, value = torch.cat([state, points[index]]), torch.cat([value, values[index]])
-        return TensorDict({"tau": tau, "state": state, "value": value}, batch_size=[len(tau)])
+            weight = torch.cat([weight, weights[index]])
+        return TensorDict({"tau": tau, "state": state, "value": value, "weight": weight}, batch_size=[len(tau)])
+
+
+def face_weights(problem: ReachAvoidProblem, points: Tensor, values: Tensor) -> Tensor:
+    """Weights (K,) in [0, 1] of boundary data: the width of the layer at the face in units of `RESOLVED`, at most 1.
+
+    Speeds and widths are those along the normal of the face in coordinates in which the box of states is [-1, 1]^n. The
+    best control moves away from B, and towards A. One coordinate of it after the other is taken from its two bounds,
+    which is exact for a drift that is affine in u.
+
+    Args:
+        problem: the physics and the sets.
+        points: points (K, n) of the faces.
+        values: V (K,) there, 1 on the faces of A and 0 on those of B.
+    """
+    _, half_width = problem.states.center_and_half_width(points)
+    normal = torch.nn.functional.normalize(_outward(problem, points, values) * half_width, dim=-1)
+    on_target = values > 0.5
+
+    def speed(u: Tensor) -> Tensor:
+        return (problem.drift(points, u) / half_width * normal).sum(-1)
+
+    u = problem.controls.denormalize(points.new_zeros(len(points), problem.controls.dim))
+    for axis, (low, high) in enumerate(zip(problem.controls.low, problem.controls.high, strict=True)):
+        lower, upper = (u.index_fill(-1, torch.tensor(axis), bound) for bound in (low, high))
+        prefer_upper = (speed(upper) > speed(lower)) != on_target
+        u = torch.where(prefer_upper.unsqueeze(-1), upper, lower)
+    across = (problem.diffusion(points, u) / half_width.unsqueeze(-1) * normal.unsqueeze(-1)).sum(-2)
+    away = speed(u)
+    layer = across.square().sum(-1) / (2 * away)
+    return torch.where(away > 0, layer / RESOLVED, 1.0).clamp(max=1)
+
+
+def _outward(problem: ReachAvoidProblem, points: Tensor, values: Tensor) -> Tensor:
+    """The gradient (K, n) of the level of the set on whose face a point lies."""
+    x = points.detach().requires_grad_()
+    with torch.enable_grad():
+        level = problem.avoid_constraints(x).amin(-1)
+        if problem.objective == "reach-avoid":
+            level = torch.where(values > 0.5, problem.reached_constraints(x).amax(-1), level)
+        return torch.autograd.grad(level.sum(), x)[0]
