@@ -97,18 +97,32 @@ class ReachAvoidEnv(EnvBase):
         flag = Categorical(2, one, dtype=torch.bool, device=device)
         self.done_spec = Composite(done=flag, terminated=flag.clone(), shape=bs, device=device)
 
+    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Start new episodes where one has ended.
+
+        TorchRL's method hides all states from `_reset`. Here the distribution of the initial states sees those of the
+        paths that go on.
+        """
+        return self.reset(tensordict, set_state=False) if self.any_done(tensordict) else tensordict
+
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+        size, dtype = (*self.batch_size, self.problem.states.dim), torch.get_default_dtype()
+        ended = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
+        tau, state = (torch.zeros(shape, dtype=dtype, device=self.device) for shape in ((*self.batch_size, 1), size))
         visited = None
-        if tensordict is not None and "_reset" in tensordict.keys() and "state" in tensordict.keys():
-            visited = tensordict["state"][~tensordict["_reset"].reshape(-1)]
-        steps, state = self.initial_states.sample(
-            self.problem, self.batch_size[0], self.max_steps, self.rng, torch.get_default_dtype(), visited
+        if tensordict is not None and {"_reset", "tau", "state"} <= set(tensordict.keys()):
+            ended = tensordict["_reset"].reshape(-1)
+            tau, state = tensordict["tau"].clone(), tensordict["state"].clone()
+            visited = state[~ended]
+        steps, started = self.initial_states.sample(
+            self.problem, int(ended.sum()), self.max_steps, self.rng, dtype, visited
         )
-        state = self.problem.states.wrap(state)
+        tau[ended] = self.simulator.clock.time(steps).to(dtype).unsqueeze(-1)
+        state[ended] = self.problem.states.wrap(started)
         none = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
         return TensorDict(
             {
-                "tau": self.simulator.clock.time(steps).to(state.dtype).unsqueeze(-1),
+                "tau": tau,
                 "state": state,
                 "noise": torch.zeros_like(state),
                 "is_init": ~none,

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
 
 from pirl_rl.collectors import ControlVariate
-from pirl_rl.collectors.transitions import Exploration, Transitions, exploring_policy
+from pirl_rl.collectors.transitions import Exploration, PlayedPolicy, Transitions
 from pirl_rl.envs import ReachAvoidEnv
 from pirl_rl.errors import ArgumentError, Interrupted
 from pirl_rl.networks import Actor, Critic, stack
@@ -90,7 +90,7 @@ def test_the_policy_notes_the_slope_of_the_mean_of_the_critics():
     # sigma is 1 and dt 0.04: the deviation of V in a step is a fifth of its slope.
     for limit in (10.0, 0.2 * slope.abs().median().item()):
         variate = ControlVariate(solution, Simulator(problem, 0.04), compile=False, limit=limit)
-        policy = exploring_policy(solution.actor, Exploration(0.0, "always"), variate)
+        policy = PlayedPolicy(solution.actor, Exploration(0.0, "always"), variate)
         played = policy(TensorDict({"tau": tau, "state": x, "is_init": torch.ones(7, 1, dtype=torch.bool)}, [7]))
         largest = (2 * limit * (v * (1 - v)).clamp(min=0).sqrt() / 0.2).clamp(min=5e-6)
         shortened = torch.minimum(torch.maximum(slope, -largest), largest)

@@ -74,6 +74,27 @@ def test_partial_reset_leaves_the_others_alone():
     assert not fresh["terminated"][chosen].any()
 
 
+def test_starts_are_drawn_for_ended_episodes_alone_and_see_the_others():
+    """Along a rollout, as a collector plays it; TorchRL by itself would hide the states of the other paths."""
+    calls = []
+
+    class Recording(UniformStates):
+        def sample(self, problem, count, max_steps, rng, dtype, visited=None):
+            calls.append((count, visited))
+            return super().sample(problem, count, max_steps, rng, dtype, visited)
+
+    env = Reach1DEnv(num_envs=64, seed=0, initial_states=Recording())
+    td = env.reset()
+    assert calls.pop() == (64, None)
+    for _ in range(5):
+        stepped, td = env.step_and_maybe_reset(env.rand_action(td))
+        ended = stepped["next", "done"].squeeze(-1)
+        (count, visited), calls = calls[0], []
+        assert 0 < count == int(ended.sum())
+        assert torch.equal(visited, stepped["next", "state"][~ended])
+        assert torch.equal(td["state"][~ended], visited)
+
+
 def test_is_init_marks_first_states_alone():
     env = Reach1DEnv(num_envs=256, seed=0)
     td, ends = env.reset(), 0

@@ -18,7 +18,7 @@ from torchrl import collectors as torchrl_collectors
 from torchrl.weight_update import SharedMemWeightSyncScheme
 
 from pirl_rl.collectors.buffers import buffer_state, check_sizes, fill_buffer, load_buffer, make_buffer
-from pirl_rl.collectors.transitions import ControlVariate, Exploration, Transitions, exploring_policy
+from pirl_rl.collectors.transitions import ControlVariate, Exploration, PlayedPolicy, Transitions
 from pirl_rl.envs import ReachAvoidEnv
 from pirl_rl.errors import ArgumentError, CollectorError
 from pirl_rl.internals import lock_writes_with, write_lock
@@ -114,7 +114,7 @@ class MultiAsyncCollector:
         recipes = [self._env.recipe(seed) for seed in seeds]
         self._copy = copy.deepcopy(self._networks).cpu()
         actor, *control_variate = self._copy
-        self._policy = exploring_policy(actor, self._exploration, *control_variate)
+        self._policy = PlayedPolicy(actor, self._exploration, *control_variate)
         # The state of the random generator does not survive being sent to a spawned process, and only the learner's
         # process watches the workers.
         self.buffer.set_rng(None)

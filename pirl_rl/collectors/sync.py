@@ -9,7 +9,7 @@ from torchrl.collectors import Collector
 
 from pirl_rl.checkpoint import restore_rng
 from pirl_rl.collectors.buffers import buffer_state, check_sizes, fill_buffer, load_buffer, make_buffer
-from pirl_rl.collectors.transitions import ControlVariate, Exploration, Transitions, exploring_policy
+from pirl_rl.collectors.transitions import ControlVariate, Exploration, PlayedPolicy, Transitions
 from pirl_rl.envs import ReachAvoidEnv
 from pirl_rl.internals import carried, plays_at_random
 from pirl_rl.networks import Actor
@@ -61,7 +61,7 @@ class SyncCollector:
         self._exploration = Exploration(exploration_noise, exploration)
         self._collector = Collector(
             env,
-            exploring_policy(actor, self._exploration, control_variate),
+            PlayedPolicy(actor, self._exploration, control_variate),
             frames_per_batch=frames_per_batch,
             total_frames=-1,
             init_random_frames=-(-warmup_frames // frames_per_batch) * frames_per_batch,

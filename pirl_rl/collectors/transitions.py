@@ -12,11 +12,11 @@ The cost is one gradient of V at each step, for any number of noise channels.
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from pirl_rl.compilation import Compiled
@@ -106,17 +106,27 @@ class ControlVariate(nn.Module):
         return slope * (bound / torch.maximum(deviation, bound)).unsqueeze(-1)
 
 
-def exploring_policy(
-    actor: nn.Module, exploration: Exploration, control_variate: nn.Module | None = None
-) -> TensorDictSequential:
-    """The actor followed by the noise and, if there is one, the control variate, as a policy for collectors."""
-    modules: list[Any] = [
-        TensorDictModule(actor, in_keys=["tau", "state"], out_keys=["loc"]),
-        TensorDictModule(exploration, in_keys=["loc", "is_init"], out_keys=["action"]),
-    ]
-    if control_variate is not None:
-        modules.append(TensorDictModule(control_variate, in_keys=["tau", "state", "loc"], out_keys=["slope"]))
-    return TensorDictSequential(*modules)
+class PlayedPolicy(TensorDictModuleBase):
+    """The actor followed by the noise and, if there is one, the control variate, as a policy for collectors.
+
+    It writes "loc", the actor's output (N, m), the played "action" (N, m) and, with a control variate, "slope" (N, n).
+    """
+
+    def __init__(self, actor: nn.Module, exploration: Exploration, control_variate: nn.Module | None = None):
+        super().__init__()
+        self.actor, self.exploration, self.control_variate = actor, exploration, control_variate
+        self.in_keys = ["tau", "state", "is_init"]
+        self.out_keys = ["loc", "action"] if control_variate is None else ["loc", "action", "slope"]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        tau, state = tensordict["tau"], tensordict["state"]
+        loc = self.actor(tau, state)
+        tensordict.set("loc", loc).set("action", self.exploration(loc, tensordict["is_init"]))
+        return (
+            tensordict
+            if self.control_variate is None
+            else tensordict.set("slope", self.control_variate(tau, state, loc))
+        )
 
 
 class Transitions:
