@@ -25,10 +25,16 @@ from pirl_rl.time_steps import propose_time_steps
 from pirl_rl.trainer import Trainer
 
 AUTO = "auto"
-"""The value of env.dt, env.substeps and trainer.updates that leaves the choice to the package."""
+"""The value that leaves a choice to the package: env.dt, env.substeps, trainer.updates and the entries of `PATHS`."""
 
 UPDATES_PER_DIMENSION, MOST_UPDATES = 5_000, 20_000
 """The number of updates that is chosen for each dimension of (tau, x), and the largest that is chosen."""
+
+PATHS = {("success", "episodes"): (10_000, 1_000), ("calibration", "rollouts"): (256, 16)}
+"""Numbers of paths of evaluators, by evaluator and argument: the largest and the smallest that are chosen."""
+
+CHEAP_PATH = 10_000
+"""The number of coordinates of all integration steps of a path up to which evaluators have the largest numbers."""
 
 
 def pick_device(name: str) -> torch.device:
@@ -99,6 +105,7 @@ def make_trainer(
     problem = make_problem(config, trust) if problem is None else problem
     choose_time_steps(config, problem)
     choose_updates(config, problem)
+    choose_paths(config, problem)
     supplied = {"problem": problem, "seed": physics, "device": device, "compile_simulator": config.compile}
     env: ReachAvoidEnv = build(_without_problem(config), "env", trust, **supplied)
     parts = {"problem": problem, "simulator": env.simulator}
@@ -153,6 +160,19 @@ def choose_updates(config: DictConfig, problem: ReachAvoidProblem) -> None:
     """Replace `auto` in trainer.updates by a number, which grows with the dimensions of V(tau, x) up to a limit."""
     if config.trainer.get("updates") == AUTO:
         config.trainer.updates = min(UPDATES_PER_DIMENSION * (problem.states.dim + 1), MOST_UPDATES)
+
+
+def choose_paths(config: DictConfig, problem: ReachAvoidProblem) -> None:
+    """Replace `auto` in the numbers of paths of the evaluators by numbers that fall where each path costs much.
+
+    Otherwise the evaluation of a problem with a hundred states would take longer than its training. The time steps must
+    have been chosen before.
+    """
+    simulator = config.evaluation.simulator
+    moves = problem.horizon / simulator.dt * simulator.substeps * problem.states.dim
+    for (evaluator, argument), (most, least) in PATHS.items():
+        if config.evaluation.get(evaluator, {}).get(argument) == AUTO:
+            config.evaluation[evaluator][argument] = max(least, min(most, round(most * CHEAP_PATH / moves)))
 
 
 def _without_problem(config: DictConfig) -> DictConfig:

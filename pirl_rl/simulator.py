@@ -28,7 +28,7 @@ from pirl_rl.clock import Clock
 from pirl_rl.compilation import Compiled
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.sigma import times, transposed_times
+from pirl_rl.sigma import constant_matrix, times, transposed_times
 
 
 class Step(NamedTuple):
@@ -88,6 +88,24 @@ class Simulator:
         """Counts the control steps of the problem's horizon."""
         return Clock(self.dt, self.problem.horizon)
 
+    @property
+    def channels(self) -> int:
+        """The number w of noise channels."""
+        return self._random_numbers[0]
+
+    @cached_property
+    def constant_sigma(self) -> Tensor | None:
+        """sigma (n, w) if it depends on neither state nor control, else None."""
+        rng = torch.Generator().manual_seed(0)
+        x, u = (box.sample(256, rng, torch.float64) for box in (self.problem.states, self.problem.controls))
+        return constant_matrix(self.problem.diffusion, x, u)
+
+    def sigma(self, x: Tensor, u: Tensor, constant: Tensor | None) -> Tensor:
+        """sigma (N, n, w) at x (N, n) and u (N, m); compiled code cannot find `constant_sigma`, and is given it."""
+        if constant is None:
+            return self.problem.diffusion(x, u)
+        return constant.to(x).expand(*x.shape, constant.shape[-1])
+
     @cached_property
     def _advanced(self) -> Callable[..., tuple[Tensor, Tensor, Tensor, Tensor]]:
         return Compiled(self._advance, "the simulator") if self.compile else self._advance
@@ -108,7 +126,8 @@ class Simulator:
         reached = torch.zeros(x.shape[:-1], dtype=torch.bool, device=x.device)
         failed, noise = reached, x
         for index in range(self.substeps):
-            moved, kick, now_reached, now_failed = self._advanced(x, u, h, *self._draw(x, rng))
+            random = self._draw(x, rng)
+            moved, kick, now_reached, now_failed = self._advanced(x, u, h, *random, self.constant_sigma)
             if index == 0:
                 x, reached, failed, noise = moved, now_reached & ~now_failed, now_failed, kick
                 continue
@@ -153,10 +172,17 @@ class Simulator:
         return problem.diffusion(x, u).shape[-1], target, avoid
 
     def _advance(
-        self, x: Tensor, u: Tensor, h: Tensor, normal: Tensor, target: Tensor | None, avoid: Tensor | None
+        self,
+        x: Tensor,
+        u: Tensor,
+        h: Tensor,
+        normal: Tensor,
+        target: Tensor | None,
+        avoid: Tensor | None,
+        constant: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """One sub-step: states (N, n), sigma dW (N, n), and whether paths are in A and in B or crossed a face."""
-        problem, sigma = self.problem, self.problem.diffusion(x, u)
+        problem, sigma = self.problem, self.sigma(x, u, constant)
         kick = times(sigma, (normal * h.sqrt()).mT)
         moved = problem.states.wrap(x + problem.drift(x, u) * h[..., None] + kick)
         reached, failed = problem.reached(moved), problem.failed(moved)

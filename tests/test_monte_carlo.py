@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from pirl_rl.evaluation.monte_carlo import CHUNK, monte_carlo, wilson_interval
+from pirl_rl.evaluation.monte_carlo import CHUNK, CHUNK_ENTRIES, monte_carlo, wilson_interval
 from pirl_rl.payoffs import LipschitzPayoff
-from pirl_rl.problems import Reach1D, Safety1D
+from pirl_rl.problems import HalfSpace, Reach1D, Safety1D
 
 REACH, SAFETY = Reach1D(), Safety1D()
 SIGMAS = 4
@@ -160,6 +160,19 @@ def test_chunks_cover_every_path():
     estimate = monte_carlo(REACH, REACH.optimal_control, 2.0, x, rollouts, dt=0.5)
     exact = REACH.exact_value(torch.full((40,), 2.0), x)
     assert ((estimate.probability - exact).abs() < SIGMAS * standard_error(exact, rollouts) + 1e-6).all()
+
+
+def test_with_many_states_fewer_paths_are_simulated_at_once():
+    """Sigma of the half-space in 100 dimensions has 10^4 entries for each path; 1,677 paths have 2^24 of them."""
+    problem, sizes = HalfSpace(dim=100), []
+
+    def policy(tau, x):
+        sizes.append(len(x))
+        return problem.controls.denormalize(torch.zeros_like(x))
+
+    estimate = monte_carlo(problem, policy, 1.0, torch.zeros(2, 100), rollouts=1_000, dt=0.5)
+    assert max(sizes) == CHUNK_ENTRIES // 100**2 == 1_677
+    assert len(estimate.probability) == 2
 
 
 def test_same_kind_out_and_repeatable():

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pirl_rl.assembly import choose_time_steps, choose_updates, make_problem, make_trainer
+from pirl_rl.assembly import choose_paths, choose_time_steps, choose_updates, make_problem, make_trainer
 from pirl_rl.commands.composition import compose
 from pirl_rl.configuration import load_config, save_config
 from pirl_rl.errors import ArgumentError, ConfigError
@@ -236,3 +236,24 @@ def test_the_length_of_a_run_follows_the_number_of_states(experiment, updates):
     config = compose("train", [f"+experiment={experiment}", "trainer.updates=7"])
     choose_updates(config, make_problem(config))
     assert config.trainer.updates == 7
+
+
+@pytest.mark.parametrize(
+    ("experiment", "episodes", "rollouts"),
+    [("reach1d", 10_000, 256), ("quadrotor", 10_000, 256), ("halfspace", 1_250, 32)],
+)
+def test_evaluation_plays_fewer_paths_where_they_cost_more(experiment, episodes, rollouts):
+    """A path of the half-space has 400 steps of 2 integration steps of 100 coordinates."""
+    typed = [f"+experiment={experiment}", *(["env.problem.dim=100"] if experiment == "halfspace" else [])]
+    config = compose("train", typed)
+    problem = make_problem(config)
+    choose_time_steps(config, problem)
+    choose_paths(config, problem)
+    assert (config.evaluation.success.episodes, config.evaluation.calibration.rollouts) == (episodes, rollouts)
+
+
+def test_numbers_of_paths_that_are_given_stay():
+    config = compose("train", ["+experiment=reach1d", "evaluation.success.episodes=77"])
+    choose_time_steps(config, Safety1D())
+    choose_paths(config, Safety1D())
+    assert config.evaluation.success.episodes == 77

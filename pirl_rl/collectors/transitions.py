@@ -90,17 +90,17 @@ class ControlVariate(nn.Module):
         if self.compile_slope and self._compiled is None:
             # Not before the first call, because copies of this module are sent to other processes.
             self._compiled = Compiled(self._slope, "the control variate")
-        return (self._compiled or self._slope)(tau, state, action)
+        return (self._compiled or self._slope)(tau, state, action, self.simulator.constant_sigma)
 
-    def _slope(self, tau: Tensor, state: Tensor, action: Tensor) -> Tensor:
-        value, problem = self.critic.at(action), self.simulator.problem
+    def _slope(self, tau: Tensor, state: Tensor, action: Tensor, constant: Tensor | None) -> Tensor:
+        value, controls = self.critic.at(action), self.simulator.problem.controls
 
         def summed(x: Tensor) -> tuple[Tensor, Tensor]:
             v = value(tau.squeeze(-1), x).mean(0)
             return v.sum(), v
 
         slope, v = torch.func.grad(summed, has_aux=True)(state)
-        sigma = problem.diffusion(state, problem.controls.denormalize(action))
+        sigma = self.simulator.sigma(state, controls.denormalize(action), constant)
         deviation = transposed_times(sigma, slope).norm(dim=-1) * self.simulator.dt**0.5
         bound = (2 * self.limit * (v * (1 - v)).clamp(min=0).sqrt()).clamp(min=LEAST_DEVIATION)
         return slope * (bound / torch.maximum(deviation, bound)).unsqueeze(-1)

@@ -12,6 +12,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from pirl_rl.assembly import (
+    choose_paths,
     choose_time_steps,
     make_evaluation_simulator,
     make_evaluators,
@@ -57,6 +58,7 @@ def solve(
     solver = make_grid_solver(config, problem, trust)
     check_problem(problem)
     choose_time_steps(config, problem)
+    choose_paths(config, problem)
     print(f"solving on a grid of {' x '.join(map(str, solver.points))} nodes across the box of states", flush=True)
     started = time.perf_counter()
     # Evaluators and figures take what has the methods of a solution.

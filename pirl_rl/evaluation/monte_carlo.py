@@ -22,7 +22,10 @@ Policy = Callable[[Tensor, Tensor], Tensor]
 Array = TypeVar("Array", float, np.ndarray, Tensor)
 
 CHUNK = 32_768
-"""Number of paths that are simulated at once. It bounds the memory, and a step fits into the cache of a core."""
+"""Number of paths that are simulated at once. A step then fits into the cache of a core."""
+
+CHUNK_ENTRIES = 2**24
+"""Number of entries of sigma, over all paths that are simulated at once, which bounds the memory with many states."""
 
 
 class Estimate(NamedTuple):
@@ -126,8 +129,9 @@ def mean_payoff(
     steps = simulator.clock.split(tau)[0].clamp(min=1)
     total, unknown = torch.zeros_like(tau, dtype=torch.float64), (~known).nonzero().squeeze(-1)
     count = len(unknown) * rollouts
-    for start in range(0, count, CHUNK):
-        path = torch.arange(start, min(start + CHUNK, count), device=x.device)
+    chunk = max(1, min(CHUNK, CHUNK_ENTRIES // (x.shape[-1] * simulator.channels)))
+    for start in range(0, count, chunk):
+        path = torch.arange(start, min(start + chunk, count), device=x.device)
         _add_payoffs(total, simulator, policy, steps, tau / steps, x, unknown[path // rollouts], rng)
     return torch.where(known, value.double(), total / rollouts)
 
