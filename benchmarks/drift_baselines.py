@@ -1,16 +1,18 @@
-"""The paper's networks for the drifting problem and runs of this package, under the same evaluators.
+"""Runs of the drifting problem, and the paper's networks for it, under the same evaluators.
 
-    python benchmarks/drift_baselines.py --weights DIR RUN_DIR ... --out FOLDER
+    python benchmarks/drift_baselines.py RUN_DIR ... [--weights DIR] --out FOLDER
 
-DIR holds the paper's networks as .npz files. All models are evaluated on the package's reference states and on 31 x 31
-grids of the planes at tau = T, under the same simulators and seeds. MSE and success are over all states, "band" over
-those with friction inside the band of the targets. The paper's networks have two rows: unchanged, and masked with V = 0
-where friction puts the target out of reach, as V of our runs always is.
+DIR holds the paper's networks as .npz files. All models are evaluated on the eight draws of states in
+`benchmarks/draws`, see `drift_states.py`, on which nothing was chosen, and on 31 x 31 grids of the planes at tau = T,
+under the same simulators and seeds. Each number over the states is a mean over the draws, plus or minus the standard
+error of that mean. MSE and success are over all states, "band" over those with friction inside the band of the targets.
+The paper's networks have two rows: unchanged, and masked with V = 0 where friction puts the target out of reach, as V
+of our runs always is.
 
-The last row shows the accuracy that simulated outcomes alone allow. It is a network fitted to single Monte Carlo
-outcomes of the first run's policy under the fine simulator, from states of the same protocol with friction inside the
-band and from the planes, with other seeds. FOLDER gets `baselines.md`, `baselines.json` with all metrics, and the
-figures of every model.
+With --regression, the last row shows the accuracy that simulated outcomes alone allow. It is a network fitted to single
+Monte Carlo outcomes of the first run's policy under the fine simulator, from states of the same protocol with friction
+inside the band and from the planes, with other seeds. FOLDER gets `baselines.md`, `baselines.json` with all metrics,
+and the figures of every model; accuracy is drawn for the first draw.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -27,15 +30,17 @@ import torch
 from torch import Tensor, nn
 
 from pirl_rl import load_run
-from pirl_rl.evaluation import Accuracy, Evidence, Rollouts, Slices, evaluate, metrics_of
+from pirl_rl.evaluation import Accuracy, Evidence, Rollouts, Slices, evaluate
 from pirl_rl.evaluation.accuracy import SIMULATORS, AccuracyEvidence
 from pirl_rl.evaluation.monte_carlo import Policy, mean_payoff
-from pirl_rl.evaluation.reference_states import displaced, visited_by
+from pirl_rl.evaluation.reference_states import ReferenceStates, displaced, visited_by
 from pirl_rl.figures import draw_all, save_figures
 from pirl_rl.problems import VehicleDrift
-from pirl_rl.problems.drift.reference_states import NETWORK_BOX, DriftStates
+from pirl_rl.problems.drift.reference_states import NETWORK_BOX
 from pirl_rl.problems.drift.starts import EquilibriumStates
 from pirl_rl.simulator import Simulator
+
+DRAWS = sorted(Path(__file__).with_name("draws").glob("*.npz"))
 
 COLUMNS = {
     "paper_mse": "paper: MSE",
@@ -171,51 +176,70 @@ def unmasked(accuracy: Evidence) -> AccuracyEvidence:
     return dataclasses.replace(accuracy, comparisons=raw)
 
 
+def averaged(draws: Sequence[Evidence]) -> dict[str, float]:
+    """The mean of each metric over the draws, and its standard error under the same name with `_error`."""
+    found = [draw.metrics() for draw in draws]
+    numbers = {}
+    for key in found[0]:
+        values = np.array([metrics[key] for metrics in found])
+        numbers |= {key: values.mean().item(), f"{key}_error": (values.std(ddof=1) / len(values) ** 0.5).item()}
+    return numbers
+
+
 def markdown(results: Mapping[str, Mapping[str, float]]) -> str:
-    lines = ["| " + " | ".join(["model", *COLUMNS.values()]) + " |", "|---" + "|--:" * len(COLUMNS) + "|"]
+    columns = [key for key in COLUMNS if all(key in numbers for numbers in results.values())]
+    lines = [f"| model | {' | '.join(COLUMNS[key] for key in columns)} |", "|---" + "|--:" * len(columns) + "|"]
     for model, numbers in results.items():
-        cells = [f"{numbers[key]:.4f}" if "mse" in key else f"{numbers[key]:.3f}" for key in COLUMNS]
-        lines.append("| " + " | ".join([model, *cells]) + " |")
+        cells = [model]
+        for key in columns:
+            digits = ".4f" if "mse" in key else ".3f"
+            error = f" ± {numbers[f'{key}_error']:{digits}}" if f"{key}_error" in numbers else ""
+            cells.append(f"{numbers[key]:{digits}}{error}")
+        lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path, nargs="*", metavar="RUN_DIR")
-    parser.add_argument("--weights", type=Path, required=True)
+    parser.add_argument("--weights", type=Path)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--rollouts", type=int, default=256, help="paths from each reference state")
-    parser.add_argument("--slice-rollouts", type=int, default=64, help="paths from each point of the planes' grids")
+    parser.add_argument("--rollouts", type=int, default=128, help="paths from each state of the draws")
+    parser.add_argument("--slice-rollouts", type=int, default=64, help="paths from each point of the planes, or 0")
+    parser.add_argument("--regression", action="store_true", help="add the regression of the first run's outcomes")
     parser.add_argument("--fit-updates", type=int, default=10_000, help="updates of the regression")
     parser.add_argument("--fit-rollouts", type=int, default=1_000_000, help="simulated outcomes for the regression")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     results: dict[str, dict[str, float]] = {}
-    evaluators = {
-        "accuracy": Accuracy(DriftStates(), arguments.rollouts),
-        "slices": Slices(rollouts=arguments.slice_rollouts),
-        "rollouts": Rollouts(),
-    }
+    evaluators = {str(path): Accuracy(partial(ReferenceStates.load, path), arguments.rollouts) for path in DRAWS}
+    planes = {}
+    if arguments.slice_rollouts:
+        planes = {"slices": Slices(rollouts=arguments.slice_rollouts), "rollouts": Rollouts()}
 
     def measure(name: str, solution) -> None:
         simulator = Simulator(solution.problem, **SIMULATORS["fine"])
-        evidence = evaluate(solution, simulator, evaluators)
+        draws = [*evaluate(solution, simulator, evaluators).values()]
+        shown = evaluate(solution, simulator, planes)
+        slices = shown["slices"].metrics() if shown else {}
         if isinstance(solution, Baseline):
-            results[name] = metrics_of(evidence | {"accuracy": unmasked(evidence["accuracy"])})
+            results[name] = averaged([unmasked(draw) for draw in draws]) | slices
             name = f"{name}, masked"
-        results[name] = metrics_of(evidence)
-        save_figures(draw_all(evidence), arguments.out / name.replace(", ", "-"))
+        results[name] = averaged(draws) | slices
+        folder = arguments.out / name.replace(", ", "-").replace("/", "-")
+        save_figures(draw_all({"accuracy": draws[0], **shown}), folder)
         print(markdown({name: results[name]}).splitlines()[-1], flush=True)
 
-    for path in sorted(arguments.weights.glob("*.npz")):
+    for path in sorted(arguments.weights.glob("*.npz")) if arguments.weights else ():
         measure(path.stem, Baseline(path))
-    solutions = {run.name: load_run(run).solution for run in arguments.runs}
+    solutions = {"/".join(run.parts[-2:]): load_run(run).solution for run in arguments.runs}
     for name, solution in solutions.items():
         measure(name, solution)
-    if solutions:
+    if solutions and arguments.regression:
         name, solution = next(iter(solutions.items()))
         fitted = Regression(solution.policy, arguments.fit_updates, arguments.fit_rollouts)
         measure(f"{name}, regression of its outcomes", fitted)
+    arguments.out.mkdir(parents=True, exist_ok=True)
     (arguments.out / "baselines.md").write_text(markdown(results))
     (arguments.out / "baselines.json").write_text(json.dumps(results, indent=2) + "\n")
     print("\n" + markdown(results))

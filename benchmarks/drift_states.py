@@ -2,8 +2,8 @@
 
     python benchmarks/drift_states.py WEIGHTS/refnet_td3rand_10M.npz [--seed SEED] [--out FILE]
 
-Draw 0 is the file of the package, on which recipes and models are chosen. The draws 1 to 8, in `benchmarks/draws`, are
-for figures that are published: nothing was chosen on them.
+Recipes and models were chosen on the draws 0, which is the file of the package, to 8. The draws 11 to 18, in
+`benchmarks/draws`, are for figures that are published: nothing was chosen on them.
 
 The recipe in `pirl_rl.problems.drift.reference_states` is the paper's protocol for its table of accuracy, with another
 seed. The paper's TD3 policy for a random horizon plays 1,024 episodes without exploration noise. They start from the

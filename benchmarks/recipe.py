@@ -23,6 +23,7 @@ VARIANTS: dict[str, list[str]] = {
     "no spread": ["actor.spread=null", "critic.spread=null"],
     "ascent of the Hamiltonian": ["pirl.actor_rule={_target_:pirl_rl.actor_rules.Hamiltonian}"],
     "no last stage": ["pirl.stages=[]"],
+    "returns of 40 steps": ["pirl.n_steps=40"],
     "squares": ["pirl.td_criterion=squares"],
     "whole episodes as returns": ["pirl.n_steps=400"],
     "returns of five steps": ["pirl.n_steps=5"],

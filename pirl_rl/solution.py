@@ -13,6 +13,9 @@ from pirl_rl.networks import Actor, Critic
 from pirl_rl.operators import generator
 from pirl_rl.problem import ReachAvoidProblem
 
+CHUNK_ENTRIES = 2**22
+"""Number of entries of sigma, over all points whose residual is computed at once, which bounds the memory."""
+
 
 class Solution:
     """The learned value and policy, where V is the mean of the critics at u = pi(tau, x).
@@ -69,7 +72,10 @@ class Solution:
         tau, x = self._own(tau, x)
         action = self._action(tau, x)
         u = self.problem.controls.denormalize(action) if u is None else u
-        return generator(self.critic.at(action), self.problem, tau, x, u).mean(0)
+        entries = max(1, self.problem.diffusion(x[:1], u[:1]).numel())
+        size = max(1, CHUNK_ENTRIES // entries)
+        parts = zip(*(entry.split(size) for entry in (tau, x, action, u)), strict=True)
+        return torch.cat([generator(self.critic.at(a), self.problem, t, y, v).mean(0) for t, y, a, v in parts])
 
     # The next two are called by compiled losses. The compiler does not follow decorators of methods of objects that
     # are made while it traces, hence the blocks.

@@ -1,7 +1,7 @@
 """Run directories of the first format open through the table of renames and say what they said then.
 
-`data/format1_answers.npz` holds values and controls of `data/format1` and of `models/drift` at 64 points each, computed
-by the version that wrote these directories.
+`data/format1_answers.npz` holds values and controls of `data/format1` and `data/format1_drift` at 64 points each,
+computed by the version that wrote these directories.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pirl_rl.configuration import load_config
 from pirl_rl.run_directory import RunDirectory
 
 DATA = Path(__file__).parent / "data"
-FOLDERS = {"reach1d": DATA / "format1", "drift": DATA.parents[1] / "models" / "drift"}
+FOLDERS = {"reach1d": DATA / "format1", "drift": DATA / "format1_drift"}
 ROUNDING = 1e-6
 """Relative to the largest entry: single precision on another processor."""
 

@@ -24,9 +24,6 @@ REFUSED = {("drift_refine", method) for method in METHODS if method != "pirl"}
 TERMS = {"td3": "t", "pinn": "pb", "pinn_paper": "pb", "fixed": "t", "pirl": "t", "pirl_paper": "tpb"}
 """The loss terms of a method: temporal differences, PDE, boundary."""
 
-WITH_PHYSICS = ("drift", "drift_refine")
-"""Experiments that add the loss terms of the physics to the default recipe."""
-
 Q_METHODS = ("td3", "pirl_paper", "pinn_paper")
 
 
@@ -61,7 +58,7 @@ def test_every_pair_is_what_the_method_says_or_refused(experiment, method):
         end for stage in config.stages if "schedule" in stage for end in (stage.schedule.initial, stage.schedule.final)
     ]
     used = {name for end in ends for name, weight in zip("tpb", end, strict=True) if weight}
-    assert used == set("tpb" if experiment in WITH_PHYSICS and method in ("pirl", "fixed") else TERMS[method])
+    assert used == set(TERMS[method])
     if method in ("td3", "pinn", "pinn_paper", "fixed"):
         assert list(config.schedule.initial) == list(config.schedule.final)
         assert not any("schedule" in stage for stage in config.stages)
@@ -147,7 +144,7 @@ def test_every_constructor_argument_is_a_key(overrides):
     for key, node in found.items():
         # The collector's law of starts is mixed with that of the environment, which stands there.
         # An experiment replaces the actor rule, whose arguments therefore stand nowhere.
-        supplied = {"collector.initial_states.others": {"others"}, "loss.actor_rule": {"steps", "levels", "budget"}}
+        supplied = {"collector.initial_states": {"others"}, "loss.actor_rule": {"steps", "levels", "budget"}}
         supplied = supplied.get(key, set())
         assert {*node} | supplied >= {*arguments(node._target_)}, key
 
@@ -183,7 +180,7 @@ def test_arguments_that_no_yaml_file_names_are_reached(typed):
     trainer = make_trainer(compose("train", ["+experiment=reach1d", "+debug=default", typed]))
     found = {
         "env.problem.horizon": trainer.solution.problem.horizon,
-        "env.initial_states.tau": trainer.collector.initial_states.others.others.tau,
+        "env.initial_states.tau": trainer.collector.initial_states.others.tau,
         "loss.logit_penalty": trainer.learner.loss.logit_penalty,
     }
     key, _, value = typed.partition("=")

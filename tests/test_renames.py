@@ -15,8 +15,8 @@ from pirl_rl.errors import ConfigError
 from pirl_rl.renames import MOVED, upgraded
 from pirl_rl.run_directory import FORMAT, RunDirectory
 
-ROOT = Path(__file__).parents[1]
-DRIFT, REACH1D = ROOT / "models" / "drift" / ".hydra" / "config.yaml", ROOT / "tests" / "data" / "reach1d_format1.yaml"
+DATA = Path(__file__).parent / "data"
+DRIFT, REACH1D = DATA / "format1_drift" / ".hydra" / "config.yaml", DATA / "reach1d_format1.yaml"
 RULES = "pirl_rl.actor_rules"
 Q, HAMILTONIAN = {"_target_": f"{RULES}.Q"}, {"_target_": f"{RULES}.Hamiltonian"}
 

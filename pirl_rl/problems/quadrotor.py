@@ -51,27 +51,6 @@ class PlanarQuadrotor(ReachAvoidProblem):
     def avoid_constraints(self, x: Tensor) -> Tensor:
         return x.new_tensor(self.limits) - (x - x.new_tensor(self.hover))[..., :3].abs()
 
-    def faces(self, count: int, rng: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
-        """Points (count, 6) and values (count,): half on the faces of A, half on those of B.
-
-        They are given here because the target is too thin to be found by sampling.
-        There is no noise on position and angle, so V takes the set's value on a face of those only where the rate leads
-        into the set, and only such points are drawn.
-        """
-        half = count // 2
-        offsets = 2 * torch.rand(count, 6, generator=rng, dtype=torch.float64) - 1
-        side = torch.cat([torch.randint(6, (half,), generator=rng), torch.randint(3, (count - half,), generator=rng)])
-        rows, target = torch.arange(count), torch.arange(count) < half
-        sign = torch.where(offsets[rows, side] < 0, -1.0, 1.0).double()
-        offsets[rows, side] = sign
-        into = torch.where(target, -sign, sign)
-        rate = side % 3 + 3
-        offsets[rows, rate] = torch.where(side < 3, into * offsets[rows, rate].abs(), offsets[rows, rate])
-        low, high = (torch.tensor(corner, dtype=torch.float64) for corner in (self.states.low, self.states.high))
-        room = torch.cat([torch.tensor(self.limits, dtype=torch.float64), (high - low)[3:] / 2])
-        widths = torch.where(target[:, None], torch.tensor(self.tolerances, dtype=torch.float64), room)
-        return torch.tensor(self.hover, dtype=torch.float64) + widths * offsets, target.double()
-
     @property
     def planes(self) -> dict[str, Plane]:
         """The room, with the quadrotor level and at rest, and the angle and its rate in the middle of the room."""

@@ -22,6 +22,9 @@ from pirl_rl.sampling.initial_states import sample_interior
 RESOLVED = 0.05
 """The width of the thinnest layer at a face in which data have their full weight, in half widths of the box."""
 
+AT_ONCE = 1_024
+"""The number of points whose weights are computed at once, which bounds the memory with many states."""
+
 
 class BoundarySampler:
     """Samples points at tau = 0, and on the faces of A and B at tau in (0, T], with the value V there.
@@ -66,8 +69,11 @@ class BoundarySampler:
         rng = torch.Generator().manual_seed(seed)
         self._pool = find_faces(problem, rng)
         points, values = self._pool.points, self._pool.values
-        given = problem.faces(1, rng) is not None
-        self._weights = torch.ones_like(values) if given else face_weights(problem, points, values)
+        if problem.faces(1, rng) is not None:
+            self._weights = torch.ones_like(values)
+        else:
+            parts = zip(points.split(AT_ONCE), values.split(AT_ONCE), strict=True)
+            self._weights = torch.cat([face_weights(problem, *part) for part in parts])
 
     def sample(self, rng: torch.Generator, replay: TensorDictBase | None = None) -> TensorDict:
         """Draw N = initial + faces points.
