@@ -14,7 +14,7 @@ MODEL = ROOT / "models" / "drift"
 
 # Written over the cell tagged "parameters".
 SHORT = {
-    "01_quickstart": "UPDATES = 1_500\nCOMPILE = False",
+    "01_quickstart": "UPDATES = 2_000\nCOMPILE = False",
     "02_drift": f"MODEL = {str(MODEL)!r}\nROLLOUTS = 200",
     "03_schedules": "UPDATES, ROUNDS, CANDIDATES = 100, 1, 1\n"
     "SETTINGS = '+experiment=reach1d compile=false pirl.final=[1,1,10]'",
@@ -41,7 +41,7 @@ def printed(cell: nbformat.NotebookNode) -> str:
 def test_notebook_executes(path, tmp_path, monkeypatch):
     """The last line printed says how far the value of the last cell's run is from Monte Carlo of its own policy.
 
-    Quick start: fifteen hundred updates, enough to turn the warm-up's random play out of the buffer, leave errors of V
+    Quick start: two thousand updates, enough to turn the warm-up's random play out of the buffer, leave errors of V
     below 0.1 and 4,000 rollouts standard errors below 0.008, so 0.15 leaves room for rounding to steer training
     elsewhere; an untrained critic, near 0.5 everywhere, is off by more than 0.3.
 
