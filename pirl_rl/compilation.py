@@ -25,6 +25,7 @@ def compiled(function: Callable[..., Any], whole: bool = False) -> Callable[...,
         whole: whether a function that cannot be compiled as one program is an error. Otherwise it becomes many small
             ones, which together may be slower than none.
     """
+    _give_zeros_memory()
     # PyTorch's own overloads lack the last argument.
     return torch.compile(function, fullgraph=whole, dynamic=False, isolate_recompiles=True)  # pyright: ignore
 
@@ -66,3 +67,20 @@ def reason_of(error: Exception) -> str:
     text = str(error)
     places = FRAME.findall(text)
     return text.partition("\n")[0] + (f" ({places[-1][0]}, line {places[-1][1]})" if places else "")
+
+
+def _give_zeros_memory() -> None:
+    """Let compiled programs fill a tensor of zeros that eager code keeps without memory.
+
+    The forward mode of functions with several arguments, such as `torch.lerp`, takes such a tensor for the derivative
+    of an argument that does not vary. A compiled program would read it at the address 0, and the process would end with
+    a segmentation fault (https://github.com/pytorch/pytorch/issues/197067).
+    """
+    # The import takes a second, which commands that compile nothing need not spend.
+    from torch._inductor.decomposition import decompositions
+
+    decompositions.setdefault(torch.ops.aten._efficientzerotensor.default, _filled)
+
+
+def _filled(size: Any, **options: Any) -> torch.Tensor:
+    return torch.ops.aten.full.default(size, 0, **options)

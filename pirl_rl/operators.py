@@ -134,12 +134,12 @@ def _along_levels(levels: Callable[[Tensor], Tensor], x: Tensor, f: Tensor, sigm
     def along(function: Callable[[Tensor], Tensor], tangent: Tensor) -> Callable[[Tensor], Tensor]:
         return lambda y: torch.func.jvp(function, (y,), (tangent,))[1]
 
-    rate, kicks = along(levels, f)(x), []
-    for column in sigma.unbind(0):
-        kick = along(levels, column)
-        kicks.append(kick(x))
-        rate = rate + along(kick, column)(x) / 2
-    return rate, torch.stack(kicks) if kicks else rate.new_zeros((0, *rate.shape))
+    rate = along(levels, f)(x)
+    if not len(sigma):
+        return rate, rate.new_zeros((0, *rate.shape))
+    # All columns at once: a loop over them would be compiled column by column.
+    everywhere, kick = x.repeat(len(sigma), 1, 1), along(levels, sigma)
+    return rate + along(kick, sigma)(everywhere).sum(0) / 2, kick(everywhere)
 
 
 def _forward_mode(value: ValueFunction, tau: Tensor, x: Tensor, f: Tensor, sigma: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from torch._dynamo.utils import counters
 
 from pirl_rl import learner
 from pirl_rl.actor_rules import BestControl, ClippedSurrogate, LookAhead
+from pirl_rl.compilation import compiled
 from pirl_rl.simulator import Simulator
 
 RULES = (
@@ -22,6 +23,11 @@ RULES = (
     "learner.actor_every=1",
 )
 """A look ahead, of which the simulator's step alone is compiled, then a surrogate, which is compiled as a whole."""
+
+
+needs_compiler = pytest.mark.skipif(
+    not (shutil.which("g++") or shutil.which("clang++")), reason="torch.compile needs a C++ compiler"
+)
 
 
 def eager_calls(monkeypatch) -> list[str]:
@@ -72,7 +78,7 @@ def test_a_new_rule_is_compiled_too(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not (shutil.which("g++") or shutil.which("clang++")), reason="torch.compile needs a C++ compiler")
+@needs_compiler
 def test_a_new_rule_is_compiled_to_machine_code(tmp_path, monkeypatch):
     assert_nothing_ran_eagerly(tmp_path, eager_calls(monkeypatch))
 
@@ -108,3 +114,22 @@ def test_the_default_losses_are_one_program_each(experiment, tmp_path, monkeypat
         trainer.train()
     assert isinstance(trainer.learner.loss.actor_rule, BestControl)
     assert calls == []
+
+
+@needs_compiler
+def test_a_table_may_be_interpolated_in_physics_that_are_differentiated_twice():
+    """`torch.lerp` of a table gives its derivatives zeros without memory, at which a compiled program once crashed."""
+    table = torch.arange(9.0).view(3, 3)
+
+    def interpolated(x):
+        knot = x[:, 0].detach().long()
+        return torch.lerp(table[knot], table[knot + 1], x.square())
+
+    def curvature(x):
+        def slope(y):
+            return torch.func.jvp(interpolated, (y,), (torch.ones_like(y),))[1]
+
+        return torch.func.jvp(slope, (x,), (torch.ones_like(x),))[1]
+
+    x = 2 * torch.rand(300, 3, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(compiled(curvature, whole=True)(x), torch.full_like(x, 6.0))

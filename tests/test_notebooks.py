@@ -14,7 +14,7 @@ MODEL = ROOT / "models" / "drift"
 
 # Written over the cell tagged "parameters".
 SHORT = {
-    "01_quickstart": "UPDATES = 2_000\nCOMPILE = False",
+    "01_quickstart": "UPDATES, OWN_UPDATES, COMPILE = 2_000, 200, False",
     "02_drift": f"MODEL = {str(MODEL)!r}\nROLLOUTS = 200",
     "03_schedules": "UPDATES, ROUNDS, CANDIDATES = 100, 1, 1\n"
     "SETTINGS = '+experiment=reach1d compile=false pirl.final=[1,1,10]'",
@@ -43,7 +43,8 @@ def test_notebook_executes(path, tmp_path, monkeypatch):
 
     Quick start: two thousand updates, enough to turn the warm-up's random play out of the buffer, leave errors of V
     below 0.1 and 4,000 rollouts standard errors below 0.008, so 0.15 leaves room for rounding to steer training
-    elsewhere; an untrained critic, near 0.5 everywhere, is off by more than 0.3.
+    elsewhere; an untrained critic, near 0.5 everywhere, is off by more than 0.3. The problem of one's own, whose value
+    does not enter, has far fewer updates.
 
     Drift: along the line success falls from 1 to 0 within three of the 57 points, and beside such a step a smooth V is
     off by up to 0.5 though its own 0.5 is in the right place; 200 rollouts add standard errors of at most 0.035. So the

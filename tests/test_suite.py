@@ -14,6 +14,7 @@ from pirl_rl.commands.suite import main
 from pirl_rl.figures import draw_suite
 from pirl_rl.problems import CartPole, Exit1D, Pendulum, Reach1D
 from pirl_rl.scoring import PROBLEMS, Score, Truth, find_truth, markdown, measure
+from pirl_rl.scoring.truth import DOUBT
 from pirl_rl.simulator import Simulator
 
 SMALL = ["problems=[exit1d]", "states=50", "rollouts=20", "+debug=default", "evaluation.final=[]"]
@@ -48,6 +49,30 @@ def test_the_grid_is_the_truth_where_no_closed_form_is_known(monkeypatch):
     assert truth.source == "grid"
     assert 0 < truth.error < 0.1
     assert ((truth.value >= -1e-6) & (truth.value <= 1 + 1e-6)).all()
+
+
+class HalfSure:
+    """A grid that vouches for the left half of the box alone."""
+
+    def __init__(self, problem, points):
+        pass
+
+    def solve(self):
+        return self
+
+    def value(self, tau, x):
+        return x[:, 0]
+
+    def error(self, tau, x):
+        return 2 * DOUBT * (x[:, 0] > 0)
+
+
+def test_states_at_which_the_grid_is_in_doubt_are_replaced(monkeypatch):
+    monkeypatch.setattr("pirl_rl.scoring.truth.GridSolver", HalfSure)
+    truth = find_truth(Pendulum(), 100, 0)
+    assert len(truth.x) == 100
+    assert (truth.x[:, 0] <= 0).double().mean() > 0.85  # half of the 200 drawn ones, give or take a few
+    assert torch.equal(truth.value, truth.x[:, 0])
 
 
 def test_states_are_reproducible_and_outside_the_sets():

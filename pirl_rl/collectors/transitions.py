@@ -122,11 +122,9 @@ class PlayedPolicy(TensorDictModuleBase):
         tau, state = tensordict["tau"], tensordict["state"]
         loc = self.actor(tau, state)
         tensordict.set("loc", loc).set("action", self.exploration(loc, tensordict["is_init"]))
-        return (
-            tensordict
-            if self.control_variate is None
-            else tensordict.set("slope", self.control_variate(tau, state, loc))
-        )
+        if self.control_variate is not None:
+            tensordict.set("slope", self.control_variate(tau, state, loc))
+        return tensordict
 
 
 class Transitions:

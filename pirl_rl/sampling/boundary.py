@@ -10,6 +10,8 @@ face whose layer s^2 / (2 v) is thinner than a network resolves would pull V dow
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -66,14 +68,16 @@ class BoundarySampler:
         if not 0 <= replay_share <= 1:
             raise ArgumentError(f"boundary.replay_share: expected 0 <= replay_share <= 1, got {replay_share}")
         self.replay_share, self.box = replay_share, problem.states.expand(widen)
-        rng = torch.Generator().manual_seed(seed)
-        self._pool = find_faces(problem, rng)
+        self._pool = find_faces(problem, torch.Generator().manual_seed(seed))
+
+    @cached_property
+    def _weights(self) -> Tensor:
+        """The weights of the pool, which are not needed where the boundary has no weight in the loss."""
         points, values = self._pool.points, self._pool.values
-        if problem.faces(1, rng) is not None:
-            self._weights = torch.ones_like(values)
-        else:
-            parts = zip(points.split(AT_ONCE), values.split(AT_ONCE), strict=True)
-            self._weights = torch.cat([face_weights(problem, *part) for part in parts])
+        if self.problem.faces(1, torch.Generator()) is not None:
+            return torch.ones_like(values)
+        parts = zip(points.split(AT_ONCE), values.split(AT_ONCE), strict=True)
+        return torch.cat([face_weights(self.problem, *part) for part in parts])
 
     def sample(self, rng: torch.Generator, replay: TensorDictBase | None = None) -> TensorDict:
         """Draw N = initial + faces points.

@@ -17,6 +17,15 @@ EARLIEST = 0.1
 GRID_POINTS = {1: 401, 2: 241}
 """Nodes of the grid along each axis, by the number of states. In three states the grid takes too long for a table."""
 
+DOUBT = 0.03
+"""The grid is no truth at a state for which its estimate of its own error is larger: another state is taken there.
+
+Such states lie where V jumps, as next to a corner of a set that the noise cannot reach from all sides.
+"""
+
+SPARE = 2
+"""How many times as many states are drawn, so that there are others to take."""
+
 
 @dataclass(frozen=True)
 class Truth:
@@ -24,7 +33,7 @@ class Truth:
 
     Attributes:
         tau: times to go (N,), in s, uniform above a tenth of the horizon.
-        x: states (N, n), uniform in the part of the box outside A and B.
+        x: states (N, n), uniform in the part of the box outside A and B, but for those at which a grid is in doubt.
         value: V (N,), or None where neither a closed form nor a grid gives it.
         source: "exact", "grid" or "none".
         error: the mean of the grid's estimate of its own error, 0 for exact values.
@@ -38,14 +47,16 @@ class Truth:
 
 
 def find_truth(problem: ReachAvoidProblem, count: int, seed: int) -> Truth:
-    """The reference values at `count` random states."""
+    """The reference values at `count` random states, for a grid those that it can vouch for."""
     rng = torch.Generator().manual_seed(seed)
-    x = sample_interior(problem, problem.states, count, rng, torch.float64)
-    tau = problem.horizon * (EARLIEST + (1 - EARLIEST) * torch.rand(count, generator=rng, dtype=x.dtype))
-    exact = problem.exact_value(tau, x)
+    x = sample_interior(problem, problem.states, SPARE * count, rng, torch.float64)
+    tau = problem.horizon * (EARLIEST + (1 - EARLIEST) * torch.rand(len(x), generator=rng, dtype=x.dtype))
+    exact = problem.exact_value(tau[:count], x[:count])
     if exact is not None:
-        return Truth(tau, x, exact, "exact")
+        return Truth(tau[:count], x[:count], exact, "exact")
     if problem.states.dim not in GRID_POINTS:
-        return Truth(tau, x, None, "none")
+        return Truth(tau[:count], x[:count], None, "none")
     grid = GridSolver(problem, GRID_POINTS[problem.states.dim]).solve()
-    return Truth(tau, x, grid.value(tau, x), "grid", grid.error(tau, x).mean().item())
+    error = grid.error(tau, x)
+    kept = (error > DOUBT).long().argsort(stable=True)[:count]
+    return Truth(tau[kept], x[kept], grid.value(tau[kept], x[kept]), "grid", error[kept].mean().item())
