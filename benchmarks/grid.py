@@ -1,7 +1,8 @@
-"""Accuracy and time of the grid solver: closed forms at three meshes, and Monte Carlo of its own policy in 3-D.
+"""Accuracy and time of the grid solver: closed forms at three meshes, Monte Carlo of its own policy, and a run's.
 
 python benchmarks/grid.py            # one and two dimensions
 python benchmarks/grid.py --dubins   # the Dubins car in three dimensions, some minutes
+python benchmarks/grid.py --run RUN_DIR   # a run with at most three states: its success and that of the grid's policy
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import time
 
 import torch
 
+from pirl_rl import load_run
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.grid import GridSolver
 from pirl_rl.problems import DubinsCar, Exit1D, HalfSpace, RadialExit, Reach1D
@@ -61,12 +63,29 @@ def dubins(points: int, rollouts: int = 2_000) -> None:
     print(f"share of the states within three standard errors {(distance <= 3 * noise).double().mean():.2f}")
 
 
+def against(run_dir: str, points: int, rollouts: int = 400, count: int = 400) -> None:
+    """Print the mean success of a run's policy and of the grid's, at the same states and with the same noise."""
+    run = load_run(run_dir)
+    problem, simulator = run.problem, run.simulator
+    solution, (tau, x) = GridSolver(problem, points).solve(), states(problem, count)
+    steps = {"dt": simulator.dt, "substeps": simulator.substeps, "crossing": simulator.crossing}
+    for name, policy in (("run", run.solution.policy), ("grid", solution.policy)):
+        played = monte_carlo(problem, policy, tau, x, rollouts=rollouts, **steps)
+        error = (played.probability * (1 - played.probability) / rollouts).sum().sqrt() / len(x)
+        print(f"success of the {name}'s policy {played.probability.mean():.4f} +- {error:.4f}", flush=True)
+    print(f"mean V of the grid {solution.value(tau, x).mean():.4f}, estimate {solution.error(tau, x).mean():.4f}")
+    print(f"mean V of the run {run.solution.value(tau, x).mean():.4f}")
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--dubins", action="store_true")
     parser.add_argument("--points", type=int, default=51)
+    parser.add_argument("--run")
     arguments = parser.parse_args()
-    if arguments.dubins:
+    if arguments.run:
+        against(arguments.run, arguments.points)
+    elif arguments.dubins:
         dubins(arguments.points)
     else:
         closed_forms()
