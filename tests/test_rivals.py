@@ -46,10 +46,16 @@ def test_a_car_that_cannot_stop_has_no_regulator():
         linear_quadratic(DubinsCar(), Simulator(DubinsCar(), 0.1), 0.0, 0)
 
 
-@pytest.mark.parametrize("name", ["ppo", "sac"])
-def test_learners_of_the_library_learn_to_reach(name):
-    """After some seconds their policy is nearer to the optimum of the one-dimensional benchmark than to its reverse."""
+@pytest.mark.parametrize(("name", "calls"), [("ppo", 2_560), ("sac", 400)])
+def test_learners_of_the_library_learn_to_reach(name, calls, monkeypatch):
+    """Their policy comes nearer to the optimum of the one-dimensional benchmark than to its reverse.
+
+    A number of steps of all paths takes the place of the time that ends a training, which differs between machines.
+    """
     pytest.importorskip("stable_baselines3")
+    from pirl_rl.rivals import stable_baselines
+
+    monkeypatch.setattr(stable_baselines.Stopwatch, "_on_step", lambda callback: callback.n_calls < calls)
     problem = Reach1D()
     simulator = Simulator(problem, 0.2)
     learned = find_rival(name)(problem, simulator, 8.0, 0)

@@ -71,7 +71,8 @@ class ControlVariate(nn.Module):
     Args:
         solution: gives V, the mean of its critics.
         simulator: gives sigma and the length of a control step.
-        compile: whether the slope is compiled. Where that fails, it runs eagerly after one warning.
+        compile: whether the actor and the slope are compiled, as one program, where they are played. Where that fails,
+            they run eagerly after one warning.
         limit: the largest deviation of V in one step where V = 1/2, > 0.
 
     Raises:
@@ -83,16 +84,12 @@ class ControlVariate(nn.Module):
         if not limit > 0:
             raise ArgumentError(f"collector.control_variate.limit: expected a number > 0, got {limit}")
         self.critic, self.simulator, self.limit, self.compile_slope = solution.critic, simulator, limit, compile
-        self._compiled: Compiled | None = None
 
-    def forward(self, tau: Tensor, state: Tensor, action: Tensor) -> Tensor:
-        """The slope (N, n) of V, per unit of the state, at tau (N, 1) and state (N, n), at a frozen action (N, m)."""
-        if self.compile_slope and self._compiled is None:
-            # Not before the first call, because copies of this module are sent to other processes.
-            self._compiled = Compiled(self._slope, "the control variate")
-        return (self._compiled or self._slope)(tau, state, action, self.simulator.constant_sigma)
+    def forward(self, tau: Tensor, state: Tensor, action: Tensor, constant: Tensor | None = None) -> Tensor:
+        """The slope (N, n) of V, per unit of the state, at tau (N, 1) and state (N, n), at a frozen action (N, m).
 
-    def _slope(self, tau: Tensor, state: Tensor, action: Tensor, constant: Tensor | None) -> Tensor:
+        Compiled code cannot find `constant`, which is `simulator.constant_sigma`, and is given it.
+        """
         value, controls = self.critic.at(action), self.simulator.problem.controls
 
         def summed(x: Tensor) -> tuple[Tensor, Tensor]:
@@ -112,19 +109,29 @@ class PlayedPolicy(TensorDictModuleBase):
     It writes "loc", the actor's output (N, m), the played "action" (N, m) and, with a control variate, "slope" (N, n).
     """
 
-    def __init__(self, actor: nn.Module, exploration: Exploration, control_variate: nn.Module | None = None):
+    def __init__(self, actor: nn.Module, exploration: Exploration, control_variate: ControlVariate | None = None):
         super().__init__()
         self.actor, self.exploration, self.control_variate = actor, exploration, control_variate
         self.in_keys = ["tau", "state", "is_init"]
         self.out_keys = ["loc", "action"] if control_variate is None else ["loc", "action", "slope"]
+        self._compiled: Compiled | None = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         tau, state = tensordict["tau"], tensordict["state"]
+        if self.control_variate is None:
+            loc = self.actor(tau, state)
+        else:
+            if self.control_variate.compile_slope and self._compiled is None:
+                # Not before the first call, because copies of this module are sent to other processes.
+                self._compiled = Compiled(self._with_slope, "the policy with its control variate")
+            constant = self.control_variate.simulator.constant_sigma
+            loc, slope = (self._compiled or self._with_slope)(tau, state, constant)
+            tensordict.set("slope", slope)
+        return tensordict.set("loc", loc).set("action", self.exploration(loc, tensordict["is_init"]))
+
+    def _with_slope(self, tau: Tensor, state: Tensor, constant: Tensor | None) -> tuple[Tensor, Tensor]:
         loc = self.actor(tau, state)
-        tensordict.set("loc", loc).set("action", self.exploration(loc, tensordict["is_init"]))
-        if self.control_variate is not None:
-            tensordict.set("slope", self.control_variate(tau, state, loc))
-        return tensordict
+        return loc, self.control_variate(tau, state, loc, constant)  # type: ignore[misc]
 
 
 class Transitions:
