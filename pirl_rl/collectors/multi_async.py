@@ -114,7 +114,7 @@ class MultiAsyncCollector:
         recipes = [self._env.recipe(seed) for seed in seeds]
         self._copy = copy.deepcopy(self._networks).cpu()
         actor, *control_variate = self._copy
-        self._policy = PlayedPolicy(actor, self._exploration, *control_variate)
+        self._policy = PlayedPolicy(actor, self._exploration, *control_variate)  # type: ignore[arg-type]
         # The state of the random generator does not survive being sent to a spawned process, and only the learner's
         # process watches the workers.
         self.buffer.set_rng(None)
