@@ -1,8 +1,10 @@
-"""Accuracy and time of the grid solver: closed forms at three meshes, Monte Carlo of its own policy, and a run's.
+"""Accuracy and time of the grid solver: closed forms at three meshes, and Monte Carlo of its own policy.
+
+It also compares the success of a run's policy with that of the grid's.
 
 python benchmarks/grid.py            # one and two dimensions
 python benchmarks/grid.py --dubins   # the Dubins car in three dimensions, some minutes
-python benchmarks/grid.py --run RUN_DIR   # a run with at most three states: its success and that of the grid's policy
+python benchmarks/grid.py --run RUN_DIR   # a run with at most three states
 """
 
 from __future__ import annotations
@@ -80,8 +82,8 @@ def against(run_dir: str, points: int, rollouts: int = 400, count: int = 400) ->
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--dubins", action="store_true")
-    parser.add_argument("--points", type=int, default=51)
-    parser.add_argument("--run")
+    parser.add_argument("--points", type=int, default=51, help="nodes along each axis")
+    parser.add_argument("--run", help="compare the policy of this run directory with the grid's")
     arguments = parser.parse_args()
     if arguments.run:
         against(arguments.run, arguments.points)

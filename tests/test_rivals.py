@@ -58,7 +58,7 @@ def test_learners_of_the_library_learn_to_reach(name, calls, monkeypatch):
     monkeypatch.setattr(stable_baselines.Stopwatch, "_on_step", lambda callback: callback.n_calls < calls)
     problem = Reach1D()
     simulator = Simulator(problem, 0.2)
-    learned = find_rival(name)(problem, simulator, 8.0, 0)
+    learned = find_rival(name)(problem, simulator, math.inf, 0)
     tau, x = torch.full((50,), 2.0), torch.linspace(-0.8, 0.8, 50).unsqueeze(-1)
     control = learned(tau, x)
     assert control.shape == (50, 1)

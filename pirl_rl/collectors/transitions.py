@@ -85,7 +85,7 @@ class ControlVariate(nn.Module):
             raise ArgumentError(f"collector.control_variate.limit: expected a number > 0, got {limit}")
         self.critic, self.simulator, self.limit, self.compile_slope = solution.critic, simulator, limit, compile
 
-    def forward(self, tau: Tensor, state: Tensor, action: Tensor, constant: Tensor | None = None) -> Tensor:
+    def forward(self, tau: Tensor, state: Tensor, action: Tensor, constant: Tensor | None) -> Tensor:
         """The slope (N, n) of V, per unit of the state, at tau (N, 1) and state (N, n), at a frozen action (N, m).
 
         Compiled code cannot find `constant`, which is `simulator.constant_sigma`, and is given it.

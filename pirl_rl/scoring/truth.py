@@ -47,7 +47,10 @@ class Truth:
 
 
 def find_truth(problem: ReachAvoidProblem, count: int, seed: int) -> Truth:
-    """The reference values at `count` random states, for a grid those that it can vouch for."""
+    """The reference values at `count` random states.
+
+    Where they come from a grid, states at which it is in doubt are taken only if too few of the drawn ones are left.
+    """
     rng = torch.Generator().manual_seed(seed)
     x = sample_interior(problem, problem.states, SPARE * count, rng, torch.float64)
     tau = problem.horizon * (EARLIEST + (1 - EARLIEST) * torch.rand(len(x), generator=rng, dtype=x.dtype))
