@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -122,7 +123,8 @@ def test_a_stage_of_policy_gradients_follows_its_own_noise_alone(collector, tmp_
 
     def watch(weights, progress):
         loss, replay = trainer.learner.loss, trainer.collector.buffer[:]
-        off = (replay["action"] - replay["loc"]).abs()
+        with getattr(trainer.collector, "_write_lock", nullcontext()):  # without it, rows may be half written
+            off = (replay["action"] - replay["loc"]).abs()
         seen.append((type(loss.actor_rule), trainer.collector.exploration_noise, len(replay) >= 128, off.amax().item()))
         return sample(weights, progress)
 
