@@ -27,7 +27,7 @@ from pirl_rl.trainer import Trainer
 AUTO = "auto"
 """The value that leaves a choice to the package: env.dt, env.substeps, trainer.updates and the entries of `PATHS`."""
 
-UPDATES_PER_DIMENSION, MOST_UPDATES = 5_000, 20_000
+UPDATES_PER_DIMENSION, MOST_UPDATES = 3_500, 20_000
 """The number of updates that is chosen for each dimension of (tau, x), and the largest that is chosen."""
 
 PATHS = {("success", "episodes"): (10_000, 1_000), ("calibration", "rollouts"): (256, 16)}
@@ -195,7 +195,8 @@ def make_grid_solver(config: DictConfig, problem: ReachAvoidProblem, trust: Sequ
 
 def make_evaluation_simulator(config: DictConfig, problem: ReachAvoidProblem) -> Simulator:
     """The simulator of the evaluators."""
-    return build(config.evaluation.simulator, "evaluation.simulator", problem=problem)
+    compile = None if config.get("compile", True) else False
+    return build(config.evaluation.simulator, "evaluation.simulator", problem=problem, compile=compile)
 
 
 def make_evaluators(config: DictConfig, when: str, trust: Sequence[str]) -> dict[str, Evaluator]:

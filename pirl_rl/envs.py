@@ -79,7 +79,7 @@ class ReachAvoidEnv(EnvBase):
         """A picklable function that builds a copy of this environment on the CPU, with the given seed."""
         steps = {name: getattr(self.simulator, name) for name in ("dt", "substeps", "crossing")}
         others = {"initial_states": self.initial_states, "num_envs": self.batch_size[0], "seed": seed}
-        return partial(ReachAvoidEnv, self.problem, **steps, **others, compile_simulator=self.simulator.compile)
+        return partial(ReachAvoidEnv, self.problem, **steps, **others, compile_simulator=bool(self.simulator.compile))
 
     def _make_specs(self) -> None:
         problem, bs, device = self.problem, self.batch_size, self.device

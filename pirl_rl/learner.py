@@ -16,6 +16,7 @@ from pirl_rl.compilation import compiled, is_compiler_failure, reason_of
 from pirl_rl.curriculum import StageSettings
 from pirl_rl.errors import ArgumentError, DivergenceError
 from pirl_rl.losses import PIRLLoss
+from pirl_rl.optimizers import optimizers
 from pirl_rl.schedules import WEIGHTS, Weights
 
 EXPLOSION = 1e6
@@ -25,11 +26,12 @@ LossFunction = Callable[[TensorDictBase], tuple[Tensor, dict[str, Tensor]]]
 
 
 class Learner:
-    """Updates the networks of a loss with Adam.
+    """Updates the networks of a loss.
 
     Args:
         loss: the loss, with the critics, the actor and their target networks.
-        learning_rate: Adam's initial learning rate, for the critics and the actor.
+        learning_rate: the initial learning rate, for the critics and the actor.
+        optimizer: "adam", or "muon" for the weights between hidden layers, see `pirl_rl.optimizers`.
         decay: "cosine" lowers the learning rate to 0 by (1 + cos(pi t)) / 2 for t from 0 to 1, "constant" keeps it.
         actor_every: the number of critic updates for each update of the actor and the target networks, d_up in the
             paper.
@@ -38,13 +40,14 @@ class Learner:
             one warning.
 
     Raises:
-        ArgumentError: a number is out of range, or `decay` is unknown.
+        ArgumentError: a number is out of range, or `decay` or `optimizer` is unknown.
     """
 
     def __init__(
         self,
         loss: PIRLLoss,
         learning_rate: float = 3e-3,
+        optimizer: Literal["adam", "muon"] = "adam",
         decay: Literal["cosine", "constant"] = "cosine",
         actor_every: int = 2,
         polyak: float = 0.005,
@@ -52,6 +55,8 @@ class Learner:
     ):
         if decay not in ("cosine", "constant"):
             raise ArgumentError(f"learner.decay: expected 'cosine' or 'constant', got {decay!r}")
+        if optimizer not in ("adam", "muon"):
+            raise ArgumentError(f"learner.optimizer: expected 'adam' or 'muon', got {optimizer!r}")
         if not learning_rate > 0 or actor_every < 1 or not 0 < polyak <= 1:
             raise ArgumentError(
                 "learner: expected learning_rate > 0, actor_every >= 1 and 0 < polyak <= 1, "
@@ -60,8 +65,8 @@ class Learner:
         self.loss = loss
         self.learning_rate, self.decay, self.actor_every = learning_rate, decay, actor_every
         self.targets = SoftUpdate(loss, tau=polyak)
-        self.critic_optimizer = _adam(loss.qvalue_network_params, learning_rate)
-        self.actor_optimizer = _adam(loss.actor_network_params, learning_rate)
+        self.critic_optimizers = optimizers(loss.qvalue_network_params, learning_rate, optimizer)
+        self.actor_optimizers = optimizers(loss.actor_network_params, learning_rate, optimizer)
         self.train_actor = True
         self.compile = compile
         self._loss_actor = torch.tensor(math.nan)
@@ -70,12 +75,13 @@ class Learner:
         self._compile_actor_loss()
 
     def apply(self, settings: StageSettings) -> None:
-        """Continue with the settings of a stage; a change of the actor rule resets the optimiser of the actor."""
+        """Continue with the settings of a stage; a change of the actor rule resets the optimisers of the actor."""
         self.actor_every, self.train_actor = settings.actor_every, settings.train_actor
         self.learning_rate = settings.learning_rate
         if _name(settings.actor_rule) != self._moments_rule:
-            # Adam's moments have the scale of one objective's gradient and would misscale steps along another's.
-            self.actor_optimizer.state.clear()
+            # Moments have the scale of one objective's gradient and would misscale steps along another's.
+            for optimizer in self.actor_optimizers:
+                optimizer.state.clear()
             self._moments_rule = _name(settings.actor_rule)
         if settings.actor_rule is not self.loss.actor_rule:
             self.loss.actor_rule = settings.actor_rule
@@ -100,16 +106,16 @@ class Learner:
         """
         for name, value in zip(WEIGHTS, weights, strict=True):
             setattr(self.loss, name, value)
-        for optimizer in (self.critic_optimizer, self.actor_optimizer):
+        for optimizer in (*self.critic_optimizers, *self.actor_optimizers):
             optimizer.param_groups[0]["lr"] = self.rate(decay)
         loss, terms = self._evaluated("critic", batch)
         self._check(loss, terms, k + 1)
-        self._step(self.critic_optimizer, loss)
+        self._step(self.critic_optimizers, loss)
         if k % self.actor_every == 0:
             if self.train_actor:
                 loss_actor, _ = self._evaluated("actor", batch)
                 self._check(loss_actor, {"loss_actor": loss_actor}, k + 1)
-                self._step(self.actor_optimizer, loss_actor)
+                self._step(self.actor_optimizers, loss_actor)
                 self._loss_actor = loss_actor.detach()
             self.targets.step()
         return {**terms, "loss_actor": self._loss_actor}
@@ -134,15 +140,21 @@ class Learner:
             "loss": self.loss.state_dict(),
             "loss_actor": self._loss_actor,
             "actor_rule": self._moments_rule,
-            "critic_optimizer": self.critic_optimizer.state_dict(),
-            "actor_optimizer": self.actor_optimizer.state_dict(),
+            "critic_optimizers": [optimizer.state_dict() for optimizer in self.critic_optimizers],
+            "actor_optimizers": [optimizer.state_dict() for optimizer in self.actor_optimizers],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.loss.load_state_dict(state["loss"])
         self._loss_actor, self._moments_rule = state["loss_actor"], state["actor_rule"]
-        self.critic_optimizer.load_state_dict(state["critic_optimizer"])
-        self.actor_optimizer.load_state_dict(state["actor_optimizer"])
+        for name in ("critic_optimizers", "actor_optimizers"):
+            if len(own := getattr(self, name)) != len(state[name]):
+                raise ArgumentError(
+                    f"learner.optimizer: the checkpoint has the state of {len(state[name])} optimisers for each "
+                    f"network, expected {len(own)}; its run had another setting"
+                )
+            for optimizer, saved in zip(own, state[name], strict=True):
+                optimizer.load_state_dict(saved)
 
     # The next two methods decide what is compiled, and keep it in `_critic_loss`, `_actor_loss` and the actor rule.
 
@@ -175,10 +187,12 @@ class Learner:
             return evaluate()
 
     @staticmethod
-    def _step(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
-        optimizer.zero_grad()
+    def _step(parts: list[torch.optim.Optimizer], loss: Tensor) -> None:
+        for optimizer in parts:
+            optimizer.zero_grad()
         loss.backward()
-        optimizer.step()
+        for optimizer in parts:
+            optimizer.step()
 
     @staticmethod
     def _check(loss: Tensor, terms: dict[str, Tensor], update: int) -> None:
@@ -187,10 +201,6 @@ class Learner:
         found = ", ".join(f"{name} = {term.item():.3g}" for name, term in terms.items())
         worst = max(terms, key=lambda name: math.inf if math.isnan(value := terms[name].item()) else abs(value))
         raise DivergenceError(f"update {update}: {worst} is not finite or above {EXPLOSION:.0e}: {found}")
-
-
-def _adam(params, rate: float) -> torch.optim.Adam:
-    return torch.optim.Adam(list(params.parameters()), rate, fused=True)
 
 
 def _name(rule: object) -> str:

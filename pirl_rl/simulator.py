@@ -17,7 +17,7 @@ into their period at the end of each sub-step, before levels are taken there.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
 
@@ -63,7 +63,8 @@ class Simulator:
         dt: the length of a control step, in s.
         substeps: the number of integration steps in a control step.
         crossing: "bridge" or "endpoint", how exits within a sub-step are detected.
-        compile: whether a sub-step is compiled, for one fixed number N of paths; the random numbers stay the same.
+        compile: whether a sub-step is compiled, for one fixed number N of paths; the random numbers stay the same. None
+            leaves the choice to functions that know how many steps they play.
 
     Raises:
         ArgumentError: `dt` is not in (0, horizon], `substeps` is below 1, or `crossing` is unknown.
@@ -73,7 +74,7 @@ class Simulator:
     dt: float = 0.1
     substeps: int = 1
     crossing: Literal["bridge", "endpoint"] = "bridge"
-    compile: bool = False
+    compile: bool | None = None
 
     def __post_init__(self):
         if not 0 < self.dt <= self.problem.horizon:
@@ -87,6 +88,11 @@ class Simulator:
     def clock(self) -> Clock:
         """Counts the control steps of the problem's horizon."""
         return Clock(self.dt, self.problem.horizon)
+
+    @cached_property
+    def compiled(self) -> Simulator:
+        """The same simulator with compiled sub-steps, which are compiled once however often it is asked for."""
+        return replace(self, compile=True)
 
     @property
     def channels(self) -> int:

@@ -140,7 +140,7 @@ def test_a_stage_of_policy_gradients_follows_its_own_noise_alone(collector, tmp_
 def test_a_new_rule_starts_with_fresh_moments(tmp_path):
     trainer, steps = small_trainer(tmp_path, *POLICY, "learner.actor_every=1"), {}
     for update in (3, 5, 9, 11):
-        at_update(trainer, update, lambda u=update: steps.update({u: _steps(trainer.learner.actor_optimizer)}))
+        at_update(trainer, update, lambda u=update: steps.update({u: _steps(trainer.learner.actor_optimizers[0])}))
     trainer.train()
     assert steps == {3: {2.0}, 5: {1.0}, 9: {5.0}, 11: {1.0}}
 

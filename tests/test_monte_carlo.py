@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from pirl_rl.evaluation.monte_carlo import CHUNK, CHUNK_ENTRIES, monte_carlo, wilson_interval
+from pirl_rl.evaluation.monte_carlo import ENTRIES, PATHS, monte_carlo, wilson_interval
 from pirl_rl.payoffs import LipschitzPayoff
 from pirl_rl.problems import HalfSpace, Reach1D, Safety1D
 
@@ -153,10 +153,12 @@ def test_steps_split_tau_evenly():
         assert seen == pytest.approx([tau, 2 * tau / 3, tau / 3], rel=1e-6)
 
 
-def test_chunks_cover_every_path():
-    """More paths than one chunk, and states that share chunks: every one gets its own rollouts."""
+@pytest.mark.parametrize("compiled_from", [0, math.inf], ids=["compiled", "eager"])
+def test_every_path_is_played_where_they_do_not_all_fit_at_once(compiled_from, monkeypatch):
+    """States share the paths under way, and paths start where others end: every state gets its own rollouts."""
+    monkeypatch.setattr("pirl_rl.evaluation.monte_carlo.COMPILED_FROM", compiled_from)
     x = torch.linspace(-2, 1.9, 40).unsqueeze(-1)
-    rollouts = CHUNK // 15
+    rollouts = PATHS // 7
     estimate = monte_carlo(REACH, REACH.optimal_control, 2.0, x, rollouts, dt=0.5)
     exact = REACH.exact_value(torch.full((40,), 2.0), x)
     assert ((estimate.probability - exact).abs() < SIGMAS * standard_error(exact, rollouts) + 1e-6).all()
@@ -171,7 +173,7 @@ def test_with_many_states_fewer_paths_are_simulated_at_once():
         return problem.controls.denormalize(torch.zeros_like(x))
 
     estimate = monte_carlo(problem, policy, 1.0, torch.zeros(2, 100), rollouts=1_000, dt=0.5)
-    assert max(sizes) == CHUNK_ENTRIES // 100**2 == 1_677
+    assert max(sizes) == ENTRIES // 100**2 == 1_677
     assert len(estimate.probability) == 2
 
 

@@ -84,7 +84,7 @@ def test_weights_bring_networks_and_the_actor_plays_the_warm_up(first, tmp_path)
     [weights, *_] = sorted((first[0] / "checkpoints").glob("weights-*.pt"))
     trainer = begun(tmp_path, weights, "seed=7")
     assert_same(dict(trainer.learner.loss.state_dict()), dict(load(weights)["loss"]))
-    assert not trainer.learner.critic_optimizer.state_dict()["state"]
+    assert not any(one.state_dict()["state"] for one in trainer.learner.critic_optimizers)
     trainer.collector.start()
     assert trainer.collector.buffer.write_count == 256
     assert played_by_the_actor(trainer, 0)

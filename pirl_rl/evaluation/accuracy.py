@@ -116,11 +116,13 @@ class Accuracy:
         return meanings
 
     def __call__(self, solution: Solution, simulator: Simulator) -> AccuracyEvidence:
-        """Measure a solution under the evaluator's own simulators; the argument `simulator` is not used."""
+        """Measure a solution under the evaluator's own simulators; `simulator` says whether they may be compiled."""
         states, problem = self.states(), solution.problem
         tau, x = like(solution, states.tau, states.x)
         comparisons = {
-            name: RolloutComparison.measure(solution, Simulator(problem, **settings), tau, x, self.rollouts, self.seed)
+            name: RolloutComparison.measure(
+                solution, Simulator(problem, **settings, compile=simulator.compile), tau, x, self.rollouts, self.seed
+            )
             for name, settings in self.simulators.items()
         }
         return AccuracyEvidence(states, ~problem.unreachable(x).cpu(), comparisons)

@@ -21,11 +21,14 @@ from pirl_rl.simulator import Simulator, Step, exit_value
 Policy = Callable[[Tensor, Tensor], Tensor]
 Array = TypeVar("Array", float, np.ndarray, Tensor)
 
-CHUNK = 32_768
+PATHS = 16_384
 """Number of paths that are simulated at once. A step then fits into the cache of a core."""
 
-CHUNK_ENTRIES = 2**24
+ENTRIES = 2**24
 """Number of entries of sigma, over all paths that are simulated at once, which bounds the memory with many states."""
+
+COMPILED_FROM = 4_000_000
+"""Number of integration steps, over all paths, from which they take less time with the compilation than without."""
 
 
 class Estimate(NamedTuple):
@@ -127,12 +130,11 @@ def mean_payoff(
     x = simulator.problem.states.wrap(x)
     known, value = _known(simulator.problem, tau, x)
     steps = simulator.clock.split(tau)[0].clamp(min=1)
-    total, unknown = torch.zeros_like(tau, dtype=torch.float64), (~known).nonzero().squeeze(-1)
-    count = len(unknown) * rollouts
-    chunk = max(1, min(CHUNK, CHUNK_ENTRIES // (x.shape[-1] * simulator.channels)))
-    for start in range(0, count, chunk):
-        path = torch.arange(start, min(start + chunk, count), device=x.device)
-        _add_payoffs(total, simulator, policy, steps, tau / steps, x, unknown[path // rollouts], rng)
+    unknown = (~known).nonzero().squeeze(-1)
+    if simulator.compile is None and rollouts * simulator.substeps * int(steps[unknown].sum()) >= COMPILED_FROM:
+        simulator = simulator.compiled
+    width = max(1, min(PATHS, ENTRIES // (x.shape[-1] * simulator.channels)))
+    total = _total_payoffs(simulator, policy, steps, tau / steps, x, unknown, rollouts, width, rng)
     return torch.where(known, value.double(), total / rollouts)
 
 
@@ -143,13 +145,31 @@ def _known(problem: ReachAvoidProblem, tau: Tensor, x: Tensor) -> tuple[Tensor, 
     return on_boundary | problem.unreachable(x), value * on_boundary
 
 
-def _add_payoffs(total: Tensor, simulator: Simulator, policy: Policy, steps, h, x, owner: Tensor, rng) -> None:
-    """Simulate one path from each state x[owner] and add its payoff to total[owner]; paths that ended are dropped."""
-    x, left, h = x[owner], steps[owner], h[owner]
-    while len(owner):
-        step = simulator.step(x, policy(left * h, x).to(x.dtype), rng, dt=h)
+def _total_payoffs(simulator: Simulator, policy: Policy, steps, h, x, starts: Tensor, rollouts: int, width: int, rng):
+    """The sums (N,) of the payoffs of `rollouts` paths from each of the states x[starts], with steps of h (N,).
+
+    At most `width` paths are under way at once; others start where paths end.
+    """
+    total = torch.zeros_like(h, dtype=torch.float64)
+    begun, count = 0, len(starts) * rollouts
+    now, left, owner = x[:0], steps[:0], starts[:0]
+    while len(owner) or begun < count:
+        paths = torch.arange(begun, min(count, begun + width - len(owner)), device=x.device)
+        begun, started = begun + len(paths), starts[paths // rollouts]
+        now, left, owner = (torch.cat(parts) for parts in ((now, x[started]), (left, steps[started]), (owner, started)))
+        action = policy(left * h[owner], now).to(now.dtype)
+        step = _step(simulator, now, action, h[owner], width, rng)
         left = left - 1
         alive = ~(step.reached | step.failed) & (left > 0)
         ended = Step(*(entry[~alive] for entry in step))
         total.index_add_(0, owner[~alive], exit_value(simulator.problem, ended).double())
-        x, owner, left, h = step.state[alive], owner[alive], left[alive], h[alive]
+        now, left, owner = step.state[alive], left[alive], owner[alive]
+    return total
+
+
+def _step(simulator: Simulator, x: Tensor, u: Tensor, h: Tensor, width: int, rng: torch.Generator) -> Step:
+    """A step of up to `width` paths; compiled simulators always play `width` of them, repeating the last one."""
+    if not simulator.compile or len(x) == width:
+        return simulator.step(x, u, rng, dt=h)
+    rows = torch.arange(width, device=x.device).clamp(max=len(x) - 1)
+    return Step(*(entry[: len(x)] for entry in simulator.step(x[rows], u[rows], rng, dt=h[rows])))
