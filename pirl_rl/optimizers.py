@@ -9,7 +9,7 @@ from tensordict import TensorDictParams
 from torch import Tensor, nn
 
 RATE = 4.0
-"""A step of Muon, which turns every direction of a matrix alike, as a multiple of the learning rate that Adam has."""
+"""The length of a step of Muon along each singular direction, as a multiple of Adam's learning rate."""
 
 MOMENTUM = 0.95
 
