@@ -195,8 +195,9 @@ def make_grid_solver(config: DictConfig, problem: ReachAvoidProblem, trust: Sequ
 
 def make_evaluation_simulator(config: DictConfig, problem: ReachAvoidProblem) -> Simulator:
     """The simulator of the evaluators."""
-    compile = None if config.get("compile", True) else False
-    return build(config.evaluation.simulator, "evaluation.simulator", problem=problem, compile=compile)
+    # Functions that play many paths compile it, if anything is compiled at all.
+    may_compile = None if config.get("compile", True) else False
+    return build(config.evaluation.simulator, "evaluation.simulator", problem=problem, compile=may_compile)
 
 
 def make_evaluators(config: DictConfig, when: str, trust: Sequence[str]) -> dict[str, Evaluator]:

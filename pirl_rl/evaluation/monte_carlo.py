@@ -146,9 +146,10 @@ def _known(problem: ReachAvoidProblem, tau: Tensor, x: Tensor) -> tuple[Tensor, 
 
 
 def _total_payoffs(simulator: Simulator, policy: Policy, steps, h, x, starts: Tensor, rollouts: int, width: int, rng):
-    """The sums (N,) of the payoffs of `rollouts` paths from each of the states x[starts], with steps of h (N,).
+    """The sums (N,) of the payoffs of `rollouts` paths from each of the states x[starts], and 0 for other states.
 
-    At most `width` paths are under way at once; others start where paths end.
+    A path from the state x[i], of x (N, n), takes steps[i] of `steps` (N,) control steps of the length h[i] of h (N,),
+    in s. At most `width` paths are under way at once; others start where paths end.
     """
     total = torch.zeros_like(h, dtype=torch.float64)
     begun, count = 0, len(starts) * rollouts
