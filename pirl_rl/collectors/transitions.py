@@ -83,7 +83,7 @@ class ControlVariate(nn.Module):
         super().__init__()
         if not limit > 0:
             raise ArgumentError(f"collector.control_variate.limit: expected a number > 0, got {limit}")
-        self.critic, self.simulator, self.limit, self.compile = solution.critic, simulator, limit, compile
+        self.critic, self.simulator, self.limit, self.compiles = solution.critic, simulator, limit, compile
 
     def forward(self, tau: Tensor, state: Tensor, action: Tensor, constant: Tensor | None) -> Tensor:
         """The slope (N, n) of V, per unit of the state, at tau (N, 1) and state (N, n), at a frozen action (N, m).
@@ -121,7 +121,7 @@ class PlayedPolicy(TensorDictModuleBase):
         if self.control_variate is None:
             loc = self.actor(tau, state)
         else:
-            if self.control_variate.compile and self._compiled is None:
+            if self.control_variate.compiles and self._compiled is None:
                 # Not before the first call, because copies of this module are sent to other processes.
                 self._compiled = Compiled(self._with_slope, "the policy with its control variate")
             constant = self.control_variate.simulator.constant_sigma
