@@ -17,7 +17,9 @@ SHORT = {
     "01_quickstart": "UPDATES, OWN_UPDATES, COMPILE = 2_000, 200, False",
     "02_drift": f"MODEL = {str(MODEL)!r}\nROLLOUTS = 200",
     "03_schedules": "UPDATES, ROUNDS, CANDIDATES = 100, 1, 1\n"
-    "SETTINGS = '+experiment=reach1d compile=false pirl.final=[1,1,10]'",
+    "SETTINGS = '+experiment=reach1d compile=false pirl.final=[1,1,10] env.num_envs=256 "
+    "collector.frames_per_batch=12800 collector.warmup_frames=12800 evaluation.calibration.rollouts=64 "
+    "evaluation.success.episodes=1000'",
 }
 LIMITS = {
     "01_quickstart": {"max": 0.15},
