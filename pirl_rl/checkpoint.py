@@ -6,6 +6,7 @@ are read with `weights_only=True`, so that loading an untrusted file runs no cod
 
 from __future__ import annotations
 
+import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -30,10 +31,11 @@ def load(path: Path) -> dict[str, Any]:
     """Read a state; its tensors are on the CPU.
 
     Raises:
-        CheckpointError: the file is missing, or is not a checkpoint of this package.
+        CheckpointError: the file is missing, damaged, or not a checkpoint of this package.
     """
     if not path.is_file():
         raise CheckpointError(f"no checkpoint at {path}")
+    _check_sums(path)
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # the exception depends on what the file contains
@@ -42,6 +44,19 @@ def load(path: Path) -> dict[str, Any]:
     if not isinstance(state, dict) or not isinstance(loss := state.get("learner", state), dict) or "loss" not in loss:
         raise CheckpointError(f"{path} is not a checkpoint of pirl_rl: it has no loss module")
     return state
+
+
+def _check_sums(path: Path) -> None:
+    """Compare every entry of an archive with the checksum that `torch.save` wrote, which `torch.load` does not."""
+    if not zipfile.is_zipfile(path):
+        return
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, EOFError, ValueError, zlib.error) as error:
+        raise CheckpointError(f"{path} is damaged: {error}") from None
+    if damaged is not None:
+        raise CheckpointError(f"{path} is damaged: the checksum of its entry {damaged} is wrong")
 
 
 def loss_state(state: dict[str, Any]) -> dict[str, Any]:
@@ -63,19 +78,22 @@ def network_states(state: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any
 
 
 def check_module(state: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
-    """Refuse networks whose entries have other names or shapes than the module's.
+    """Refuse networks whose entries have other names or shapes than the module's, or are not finite.
 
     Args:
         state: the state in the checkpoint; it may have target networks that the module does not have.
         expected: the state of the module.
 
     Raises:
-        ArgumentError: an entry is missing, unexpected, or of another shape; the message names the first one.
+        ArgumentError: an entry is missing, unexpected, of another shape or not finite; the message names the first one.
     """
     check_entries(state, expected, "loss")
     for name in state.keys() - expected.keys():
         if not name.startswith(TARGET):
             raise ArgumentError(f"loss.{name}: expected no such entry, got one")
+    for name, entry in state.items():
+        if isinstance(entry, torch.Tensor) and not bool(entry.isfinite().all()):
+            raise ArgumentError(f"loss.{name}: expected finite numbers, got NaN or infinite ones")
 
 
 def check_entries(state: Any, expected: Any, key: str = "") -> None:

@@ -69,7 +69,6 @@ def start_from(trainer: Trainer, start: str) -> Path:
             check_entries(state["collector"], {"buffer": {"transitions": {}, "writer": {}}}, "collector")
             buffer = state["collector"]["buffer"]
         trainer.collector.warm_start(buffer)
-    learner.check_parameters(0)
     return path.absolute()
 
 

@@ -74,6 +74,40 @@ def test_broken_files_are_told_as_such(tmp_path):
         load(tmp_path / "absent.pt")
 
 
+def test_a_flipped_bit_is_noticed(tmp_path):
+    """At 300 random places: the file is refused, or the bit was one of the padding between entries."""
+    path, rng = tmp_path / RunDirectory.LAST.name, random.Random(0)
+    save(STATE, path)
+    good, noticed = path.read_bytes(), 0
+    for _ in range(300):
+        spoilt = bytearray(good)
+        spoilt[rng.randrange(len(good))] ^= 1 << rng.randrange(8)
+        path.write_bytes(spoilt)
+        try:
+            back = load(path)
+        except CheckpointError:
+            noticed += 1
+        else:
+            assert torch.equal(back["loss"]["weight"], STATE["loss"]["weight"])
+            assert (back["update"], back["names"]) == (STATE["update"], STATE["names"])
+            assert torch.equal(back["rng"], STATE["rng"])
+    assert noticed > 200
+
+
+def test_weights_that_are_not_finite_are_refused(tmp_path):
+    trainer = small_trainer(tmp_path)
+    trainer.train()
+    path = tmp_path / RunDirectory.LAST
+    state = load(path)
+    name = next(name for name in state["learner"]["loss"] if name.startswith("actor_network_params"))
+    state["learner"]["loss"][name].view(-1)[0] = float("nan")
+    save(state, path)
+    with pytest.raises(CheckpointError, match=rf"{name.rpartition('.')[2]}: expected finite numbers, got NaN"):
+        load_run(tmp_path)
+    with pytest.raises(CheckpointError, match=rf"loss\.{name}: expected finite numbers, got NaN"):
+        resumed(tmp_path)
+
+
 def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
     path = tmp_path / RunDirectory.LAST.name
     save(STATE, path)

@@ -204,7 +204,7 @@ def test_the_command_starts_from_a_run(first, cli, tmp_path):
         (["start=."], "no checkpoint at checkpoints/last.pt"),
         (["start=broken.pt"], "broken.pt is not a checkpoint"),
         (["start=hostile.pt"], "hostile.pt is not a checkpoint"),
-        (["start=spoilt.pt"], "is not finite"),
+        (["start=spoilt.pt"], "expected finite numbers, got NaN"),
         (["start=3"], "start: expected the path of a run or a checkpoint, got 3"),
         (["start=[a]"], "start: expected the path"),
         (["start=FIRST", "critic.hidden=[8]"], "does not fit the run's configuration"),
