@@ -194,8 +194,8 @@ def test_same_kind_out_and_repeatable():
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"x": torch.zeros(3)}, "x: expected shape"),
-        ({"x": torch.zeros(3, 2)}, "x: expected shape"),
+        ({"x": torch.zeros(3)}, "x: expected states of shape"),
+        ({"x": torch.zeros(3, 2)}, "x: expected states of shape"),
         ({"tau": -1.0}, "tau"),
         ({"tau": torch.ones(4)}, "tau"),
         ({"rollouts": 0}, "rollouts"),

@@ -6,7 +6,6 @@ indicator it is the probability to reach A before B within tau or, in an invaria
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from statistics import NormalDist
 from typing import Literal, NamedTuple, TypeVar
 
@@ -14,11 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pirl_rl.arguments import Policy, checked_points, checked_policy
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator, Step, exit_value
 
-Policy = Callable[[Tensor, Tensor], Tensor]
 Array = TypeVar("Array", float, np.ndarray, Tensor)
 
 PATHS = 16_384
@@ -104,17 +103,15 @@ def monte_carlo(
     Raises:
         ArgumentError: with the argument, what was expected and what was got.
     """
-    points = x if isinstance(x, Tensor) else torch.as_tensor(np.asarray(x), dtype=torch.get_default_dtype())
-    if points.ndim != 2 or points.shape[-1] != problem.states.dim:
-        raise ArgumentError(f"x: expected shape (N, {problem.states.dim}), got {tuple(points.shape)}")
-    times = torch.as_tensor(tau, dtype=points.dtype, device=points.device)
-    if times.shape not in ((), (len(points),)) or not bool((times >= 0).all()):
-        raise ArgumentError(f"tau: expected a number or {len(points)} of them, all >= 0, got {tau}")
+    kind = (x.dtype, x.device) if isinstance(x, Tensor) else (torch.get_default_dtype(), torch.device("cpu"))
+    times, points = checked_points(problem, tau, x, *kind)
+    if points.ndim != 2:
+        raise ArgumentError(f"x: expected states of shape (N, {problem.states.dim}), got {tuple(points.shape)}")
     if rollouts < 1:
         raise ArgumentError(f"rollouts: expected >= 1, got {rollouts}")
-    simulator, times = Simulator(problem, dt, substeps, crossing), times.expand(len(points))
+    simulator = Simulator(problem, dt, substeps, crossing)
     rng = torch.Generator(points.device).manual_seed(seed)
-    mean = mean_payoff(simulator, policy, times, points, rollouts, rng)
+    mean = mean_payoff(simulator, checked_policy(policy, problem), times, points, rollouts, rng)
     known = _known(problem, times, problem.states.wrap(points))[0]
     low, high = (torch.where(known, mean, end) for end in wilson_interval(mean * rollouts, rollouts, confidence))
     if isinstance(x, Tensor):

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pirl_rl.arguments import Policy
 from pirl_rl.errors import ArgumentError
-from pirl_rl.evaluation.monte_carlo import Policy
 from pirl_rl.evaluation.trajectories import closed_loop
 from pirl_rl.files import replacing
 from pirl_rl.layers import Periodic

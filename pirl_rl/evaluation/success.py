@@ -8,10 +8,11 @@ import dataclasses
 import torch
 from torch import Tensor
 
+from pirl_rl.arguments import Policy
 from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.evaluator import Metrics
 from pirl_rl.evaluation.inputs import points_rng
-from pirl_rl.evaluation.monte_carlo import Policy, mean_payoff, wilson_interval
+from pirl_rl.evaluation.monte_carlo import mean_payoff, wilson_interval
 from pirl_rl.payoffs import Indicator
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.initial_states import InitialStates, UniformStates

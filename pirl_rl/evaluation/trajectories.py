@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pirl_rl.evaluation.monte_carlo import Policy
+from pirl_rl.arguments import Policy
 from pirl_rl.simulator import Simulator
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from importlib import import_module
 
+from pirl_rl.arguments import Policy
 from pirl_rl.errors import ArgumentError
-from pirl_rl.evaluation.monte_carlo import Policy
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
 

@@ -8,8 +8,8 @@ from scipy.linalg import solve_continuous_are
 from scipy.optimize import least_squares
 from torch import Tensor
 
+from pirl_rl.arguments import Policy
 from pirl_rl.errors import ArgumentError
-from pirl_rl.evaluation.monte_carlo import Policy
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.faces import find_faces
 from pirl_rl.simulator import Simulator

@@ -14,8 +14,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
+from pirl_rl.arguments import Policy
 from pirl_rl.envs import ReachAvoidEnv
-from pirl_rl.evaluation.monte_carlo import Policy
 from pirl_rl.gymnasium import ReachAvoidVectorGym, observation
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator

@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from pirl_rl import checkpoint
+from pirl_rl.arguments import checked_points
 from pirl_rl.ascent import ascend, value_ahead
 from pirl_rl.assembly import make_networks, make_problem, make_simulator
 from pirl_rl.checkpoint import check_module
@@ -26,9 +27,6 @@ from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
-
-ROUNDING = 1e-6
-"""The fraction of the horizon by which tau may exceed it, because of rounding in single precision."""
 
 Crossing = Literal["bridge", "endpoint"]
 
@@ -176,20 +174,7 @@ class Run:
 
     def _arguments(self, tau, x) -> tuple[Tensor, Tensor, Callable[[Tensor], Any]]:
         """tau (*) and x (*, n) in the networks' dtype, and a function that converts results to the kind of x."""
-        state = torch.as_tensor(x, dtype=self.solution.dtype, device=self.solution.device)
-        dim, horizon = self.problem.states.dim, self.problem.horizon
-        if state.ndim < 1 or state.shape[-1] != dim:
-            raise ArgumentError(f"x: expected states of shape (*, {dim}), got {tuple(state.shape)}")
-        if not bool(state.isfinite().all()):
-            raise ArgumentError("x: expected finite states, got NaN or infinite ones")
-        times, shape = torch.as_tensor(tau, dtype=state.dtype, device=state.device), state.shape[:-1]
-        try:
-            times = times.expand(shape)
-        except RuntimeError:
-            message = f"tau: expected a number or the shape {tuple(shape)} of the states, got {tuple(times.shape)}"
-            raise ArgumentError(message) from None
-        if not bool(((times >= 0) & (times <= horizon * (1 + ROUNDING))).all()):
-            raise ArgumentError(f"tau: expected 0 <= tau <= horizon = {horizon} s, got {tau}")
+        times, state = checked_points(self.problem, tau, x, self.solution.dtype, self.solution.device)
         if isinstance(x, Tensor):
             return times, state, lambda answer: answer.to(x.device)
         return times, state, lambda answer: np.asarray(answer.cpu())

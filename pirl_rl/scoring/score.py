@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import torch
 
-from pirl_rl.evaluation.monte_carlo import Policy, mean_payoff
+from pirl_rl.arguments import Policy
+from pirl_rl.evaluation.monte_carlo import mean_payoff
 from pirl_rl.scoring.truth import Truth
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution

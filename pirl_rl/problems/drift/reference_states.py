@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from pirl_rl.evaluation.monte_carlo import Policy
+from pirl_rl.arguments import Policy
 from pirl_rl.evaluation.reference_states import ReferenceStates, visited_by
 from pirl_rl.problems import VehicleDrift
 from pirl_rl.problems.drift.starts import EquilibriumStates

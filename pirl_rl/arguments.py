@@ -1,0 +1,99 @@
+"""Checks of the states, times to go and policies that users hand in."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pirl_rl.errors import ArgumentError
+from pirl_rl.problem import ReachAvoidProblem
+
+Policy = Callable[[Tensor, Tensor], Tensor]
+"""Maps tau (N,) in s and x (N, n) to the control (N, m), both in SI units."""
+
+ROUNDING = 1e-6
+"""The share of the horizon by which tau may exceed it, because of rounding in single precision."""
+
+CONTROL_ROUNDING = 1e-4
+"""The share of its range by which a control may exceed its bounds, because of rounding in single precision."""
+
+FAR = 2.0
+"""A state is far outside the box of states if it lies outside a box of this many times the widths."""
+
+
+def checked_points(
+    problem: ReachAvoidProblem, tau: Any, x: Any, dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Times to go and states as tensors, after a check; states far outside the box of states are warned of.
+
+    Args:
+        problem: gives the number of states, their box and the horizon.
+        tau: times to go in s, a number or an array that broadcasts to (*).
+        x: states (*, n) in SI units.
+        dtype, device: of the results.
+
+    Returns:
+        The times to go (*) and the states (*, n).
+
+    Raises:
+        ArgumentError: a shape, numbers that are not finite, or a time to go outside [0, horizon].
+    """
+    state = _numbers("x", x, dtype, device)
+    dim, horizon = problem.states.dim, problem.horizon
+    if state.ndim < 1 or state.shape[-1] != dim:
+        raise ArgumentError(f"x: expected states of shape (*, {dim}), got {tuple(state.shape)}")
+    if not bool(state.isfinite().all()):
+        raise ArgumentError("x: expected finite states, got NaN or infinite ones")
+    times, shape = _numbers("tau", tau, dtype, device), state.shape[:-1]
+    try:
+        times = times.expand(shape)
+    except RuntimeError:
+        message = f"tau: expected a number or the shape {tuple(shape)} of the states, got {tuple(times.shape)}"
+        raise ArgumentError(message) from None
+    if not bool(((times >= 0) & (times <= horizon * (1 + ROUNDING))).all()):
+        raise ArgumentError(f"tau: expected 0 <= tau <= horizon = {horizon} s, got {tau}")
+    far = ~problem.states.expand(FAR).contains(state)
+    if bool(far.any()):
+        message = f"x: {int(far.sum())} of {far.numel()} states lie far outside the box of states {problem.states}"
+        warnings.warn(f"{message}; nothing is learned there", stacklevel=3)
+    return times, state
+
+
+def checked_policy(policy: Policy, problem: ReachAvoidProblem) -> Policy:
+    """The policy, whose controls are checked at every call.
+
+    The function that is returned raises an ArgumentError where the controls have another shape than (N, m), are not
+    finite, or lie outside `problem.controls`.
+    """
+    allowed = problem.controls.expand(1 + CONTROL_ROUNDING)
+
+    def checked(tau: Tensor, x: Tensor) -> Tensor:
+        control = policy(tau, x)
+        if not isinstance(control, Tensor):
+            raise ArgumentError(f"policy: expected controls as a tensor, got {type(control).__name__}")
+        expected = (len(x), problem.controls.dim)
+        if control.shape != expected:
+            raise ArgumentError(
+                f"policy: expected controls of shape {expected} for {len(x)} states, got {tuple(control.shape)}"
+            )
+        bad = ~(control.isfinite().all(-1) & allowed.contains(control))
+        if bool(bad.any()):
+            first = int(bad.nonzero()[0])
+            raise ArgumentError(
+                f"policy: expected controls in {problem.controls}, got {control[first].tolist()} at "
+                f"tau = {tau[first].item()} s, x = {x[first].tolist()}"
+            )
+        return control
+
+    return checked
+
+
+def _numbers(name: str, given: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
+    try:
+        return torch.as_tensor(given, dtype=dtype, device=device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ArgumentError(f"{name}: expected numbers, got {type(given).__name__}: {error}") from None
