@@ -78,6 +78,14 @@ def test_every_experiment_trains(experiment, cli, tmp_path, monkeypatch):
     sys.modules.pop("my_module", None)
 
 
+def test_without_arguments_it_says_what_it_needs(cli, tmp_path):
+    code, text = cli()
+    assert code == 1
+    assert "error: nothing to train was named" in text
+    assert all(name in text for name in names("experiment"))
+    assert not any(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     "setting",
     [f"{group}={name}" for group in ("method", "schedule", "logger") for name in names(group) if name != "own"],

@@ -29,6 +29,13 @@ from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.trainer import Trainer
 
+EXPERIMENTS = ", ".join(sorted(path.stem for path in (CONF / "experiment").glob("*.yaml")))
+
+NOTHING_NAMED = f"""error: nothing to train was named, expected one of
+  python -m pirl_rl.train +experiment=own env.problem._target_=my_module.MyProblem
+  python -m pirl_rl.train +experiment=NAME, with NAME among {EXPERIMENTS}
+`python -m pirl_rl` says what each experiment is."""
+
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")
 def train(config: DictConfig) -> float:
@@ -134,6 +141,9 @@ def _new(folder: Path) -> Iterator[None]:
 def main() -> None:
     quiet_libraries()
     arguments = sys.argv[1:]
+    if not arguments:
+        print(NOTHING_NAMED, file=sys.stderr)
+        sys.exit(1)
     resumed = [item for item in arguments if item.startswith("resume=") and item != "resume=null"]
     try:
         if resumed:
