@@ -29,7 +29,7 @@ class FrontLoaded(SyncCollector):
         actor: Actor,
         updates_per_batch: int = 80,
         early: int = 1_000,
-        factor: int = 4,
+        factor: int = 5,
         **settings: Any,
     ):
         super().__init__(env, actor, updates_per_batch=updates_per_batch, **settings)
