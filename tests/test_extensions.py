@@ -109,10 +109,10 @@ def test_evaluator(tmp_path):
 
 
 def test_collector(tmp_path):
-    """80 / 4 updates lie between two batches: beside the warm-up's, one is played before update 0 and one before 20."""
+    """50 / 5 updates lie between two batches: beside the warm-up's, one is played before each of updates 0, 10 and 20."""
     run = run_of("my_collector", tmp_path)
     state = checkpoint.load(run / "checkpoints" / "last.pt")
-    assert state["collector"]["frames"] == 3 * 512
+    assert state["collector"]["frames"] == 4 * 512
 
 
 def test_advisor(tmp_path, trained):
