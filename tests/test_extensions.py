@@ -109,7 +109,7 @@ def test_evaluator(tmp_path):
 
 
 def test_collector(tmp_path):
-    """50 / 5 updates lie between two batches: beside the warm-up's, one is played before each of updates 0, 10 and 20."""
+    """50 / 5 updates lie between two batches: one is the warm-up, others are played before updates 0, 10 and 20."""
     run = run_of("my_collector", tmp_path)
     state = checkpoint.load(run / "checkpoints" / "last.pt")
     assert state["collector"]["frames"] == 4 * 512
