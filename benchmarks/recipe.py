@@ -28,7 +28,7 @@ VARIANTS: dict[str, list[str]] = {
     "1024 paths": ["env.num_envs=1024"],
     "half of the transitions": ["collector.updates_per_batch=100"],
     "squares": ["pirl.td_criterion=squares"],
-    "whole episodes as returns": ["pirl.n_steps=400"],
+    "returns as long as a batch": ["pirl.n_steps=50"],
     "returns of five steps": ["pirl.n_steps=5"],
     "residual 1 and boundary 10": ["pirl.final=[1,1,10]", "schedule.center=0.2", "schedule.steepness=30"],
     "residual 0.03": ["pirl.final=[1,0.03,0]", "schedule.center=0.3", "schedule.steepness=30"],

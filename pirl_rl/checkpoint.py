@@ -53,7 +53,7 @@ def _check_sums(path: Path) -> None:
     try:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, EOFError, ValueError, zlib.error) as error:
+    except Exception as error:  # the exception depends on which bytes are damaged
         raise CheckpointError(f"{path} is damaged: {error}") from None
     if damaged is not None:
         raise CheckpointError(f"{path} is damaged: the checksum of its entry {damaged} is wrong")

@@ -39,10 +39,15 @@ def catalogue() -> str:
     known = [getattr(problems, name) for name in problems.__all__]
     parts = [_table("problems", [(problem.__name__, _first_line(problem)) for problem in known])]
     for group, title in GROUPS.items():
-        rows = [(path.stem, _comment(path)) for path in sorted((CONF / group).glob("*.yaml"))]
+        rows = [(path.stem, _comment(path)) for path in choices(group)]
         parts.append(_table(title, rows))
     commands = "\n".join(f"  {command}\n      {meaning}" for command, meaning in COMMANDS)
     return "\n\n".join([*parts, f"commands\n{commands}"])
+
+
+def choices(group: str) -> list[Path]:
+    """The files of a group of the configuration, such as "experiment", in the order of their names."""
+    return sorted((CONF / group).glob("*.yaml"))
 
 
 def _table(title: str, rows: list[tuple[str, str]]) -> str:

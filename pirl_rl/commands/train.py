@@ -16,6 +16,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from pirl_rl.assembly import make_trainer
+from pirl_rl.commands.catalogue import choices
 from pirl_rl.commands.composition import drop_leftovers, register
 from pirl_rl.commands.console import metrics_table, named_modules, override, quiet_libraries, reported
 from pirl_rl.commands.methods import check_method
@@ -29,11 +30,9 @@ from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.trainer import Trainer
 
-EXPERIMENTS = ", ".join(sorted(path.stem for path in (CONF / "experiment").glob("*.yaml")))
-
-NOTHING_NAMED = f"""error: nothing to train was named, expected one of
+NOTHING_NAMED = """error: nothing to train was named, expected one of
   python -m pirl_rl.train +experiment=own env.problem._target_=my_module.MyProblem
-  python -m pirl_rl.train +experiment=NAME, with NAME among {EXPERIMENTS}
+  python -m pirl_rl.train +experiment=NAME, with NAME among {names}
 `python -m pirl_rl` says what each experiment is."""
 
 
@@ -142,7 +141,7 @@ def main() -> None:
     quiet_libraries()
     arguments = sys.argv[1:]
     if not arguments:
-        print(NOTHING_NAMED, file=sys.stderr)
+        print(NOTHING_NAMED.format(names=", ".join(path.stem for path in choices("experiment"))), file=sys.stderr)
         sys.exit(1)
     resumed = [item for item in arguments if item.startswith("resume=") and item != "resume=null"]
     try:
