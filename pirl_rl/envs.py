@@ -26,7 +26,8 @@ from torchrl.envs import EnvBase
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem, check_problem
 from pirl_rl.sampling.initial_states import InitialStates, UniformStates
-from pirl_rl.simulator import Simulator, exit_value
+from pirl_rl.sampling.supply import Supply
+from pirl_rl.simulator import Simulator, Step, exit_value
 
 
 class ReachAvoidEnv(EnvBase):
@@ -69,11 +70,21 @@ class ReachAvoidEnv(EnvBase):
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.problem = problem
         self.simulator = Simulator(problem, dt, substeps, crossing, compile_simulator)  # type: ignore[arg-type]
-        self.initial_states: InitialStates = initial_states or UniformStates()
+        self.supply = Supply(num_envs, initial_states or UniformStates())
         self.max_steps = self.simulator.clock.max_steps
         self._make_specs()
         self.rng = torch.Generator(device=self.device)
         self.set_seed(int(torch.empty((), dtype=torch.int64).random_().item()) if seed is None else seed)
+
+    @property
+    def initial_states(self) -> InitialStates:
+        """The distribution of the initial states of episodes; another one counts from the next reset."""
+        return self.supply.distribution
+
+    @initial_states.setter
+    def initial_states(self, distribution: InitialStates) -> None:
+        if distribution is not self.supply.distribution:
+            self.supply = Supply(self.supply.size, distribution)
 
     def recipe(self, seed: int) -> Callable[[], ReachAvoidEnv]:
         """A picklable function that builds a copy of this environment on the CPU, with the given seed."""
@@ -114,9 +125,7 @@ class ReachAvoidEnv(EnvBase):
             ended = tensordict["_reset"].reshape(-1)
             tau, state = tensordict["tau"].clone(), tensordict["state"].clone()
             visited = state[~ended]
-        steps, started = self.initial_states.sample(
-            self.problem, int(ended.sum()), self.max_steps, self.rng, dtype, visited
-        )
+        steps, started = self.supply.take(self.problem, int(ended.sum()), self.max_steps, self.rng, dtype, visited)
         tau[ended] = self.simulator.clock.time(steps).to(dtype).unsqueeze(-1)
         state[ended] = self.problem.states.wrap(started)
         none = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
@@ -139,13 +148,16 @@ class ReachAvoidEnv(EnvBase):
         u = self.problem.controls.denormalize(tensordict["action"])
         step = self.simulator.step(x, u, self.rng, dt=clock.length(steps, shortfall).squeeze(-1).to(x))
         terminated = (step.reached | step.failed).unsqueeze(-1) | (steps <= 1)
+        reward, ends = torch.zeros_like(x[..., :1]), terminated.squeeze(-1)
+        if ends.any():  # the payoff of the few paths that end costs far less than that of all paths
+            reward[ends] = exit_value(self.problem, Step(*(entry[ends] for entry in step))).unsqueeze(-1)
         return TensorDict(
             {
                 "tau": clock.time(steps - 1, shortfall).to(tau),
                 "state": step.state,
                 "noise": step.noise,
                 "is_init": torch.zeros_like(terminated),
-                "reward": exit_value(self.problem, step).unsqueeze(-1) * terminated,
+                "reward": reward,
                 "done": terminated,
                 "terminated": terminated.clone(),
             },
@@ -156,3 +168,4 @@ class ReachAvoidEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self.rng.manual_seed(seed)
+            self.supply = Supply(self.supply.size, self.initial_states)

@@ -74,25 +74,57 @@ def test_partial_reset_leaves_the_others_alone():
     assert not fresh["terminated"][chosen].any()
 
 
-def test_starts_are_drawn_for_ended_episodes_alone_and_see_the_others():
-    """Along a rollout, as a collector plays it; TorchRL by itself would hide the states of the other paths."""
-    calls = []
+def test_starts_are_drawn_many_at_a_time_and_each_is_played_once():
+    """A draw along a rollout sees the states of the paths that go on, which TorchRL by itself would hide."""
+    draws = []
 
     class Recording(UniformStates):
         def sample(self, problem, count, max_steps, rng, dtype, visited=None):
-            calls.append((count, visited))
-            return super().sample(problem, count, max_steps, rng, dtype, visited)
+            draws.append((count, visited, super().sample(problem, count, max_steps, rng, dtype, visited)))
+            return draws[-1][-1]
 
     env = Reach1DEnv(num_envs=64, seed=0, initial_states=Recording())
     td = env.reset()
-    assert calls.pop() == (64, None)
-    for _ in range(5):
+    assert [draw[:2] for draw in draws] == [(64, None)]
+    left = 0
+    for _ in range(20):
+        known = len(draws)
         stepped, td = env.step_and_maybe_reset(env.rand_action(td))
         ended = stepped["next", "done"].squeeze(-1)
-        (count, visited), calls = calls[0], []
-        assert 0 < count == int(ended.sum())
-        assert torch.equal(visited, stepped["next", "state"][~ended])
-        assert torch.equal(td["state"][~ended], visited)
+        if len(draws) > known:
+            count, visited, _ = draws[-1]
+            assert len(draws) == known + 1
+            assert left < int(ended.sum())
+            assert count == 64
+            assert torch.equal(visited, stepped["next", "state"][~ended])
+            left = 64
+        first = 64 - left
+        left -= int(ended.sum())
+        steps, states = (entry[first : 64 - left] for entry in draws[-1][-1])
+        assert torch.equal(td["state"][ended], states)
+        assert torch.equal(td["tau"][ended].squeeze(-1), env.simulator.clock.time(steps).to(td["tau"]))
+        assert torch.equal(td["state"][~ended], stepped["next", "state"][~ended])
+    assert len(draws) > 3
+
+
+def test_a_seed_and_another_distribution_drop_what_is_left_of_a_draw():
+    env = Reach1DEnv(num_envs=64, seed=0)
+    first = env.reset().set("action", torch.zeros(64, 1))
+
+    def played():
+        env.set_seed(5)
+        td, states = first, []
+        for _ in range(10):
+            td = env.step_and_maybe_reset(td.clone())[1].set("action", torch.zeros(64, 1))
+            states.append(td["state"])
+        return torch.stack(states)
+
+    assert torch.equal(played(), played())
+    env.initial_states = UniformStates(low=[0.3], high=[0.31])
+    for _ in range(10):
+        td = env.step_and_maybe_reset(env.rand_action(env.reset()))[1]
+        started = td["state"][td["is_init"].squeeze(-1)]
+        assert ((started >= 0.3) & (started <= 0.31)).all()
 
 
 def test_is_init_marks_first_states_alone():

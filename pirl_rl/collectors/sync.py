@@ -114,6 +114,7 @@ class SyncCollector:
             "frames": self._collector.state_dict()["frames"],
             "carrier": carried(self._collector).to_dict(),
             "env_rng": self.env.rng.get_state(),
+            "supply": self.env.supply.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -123,6 +124,7 @@ class SyncCollector:
         self._load_frames(state["frames"])
         carried(self._collector).update(TensorDict(state["carrier"], device=self.env.device))
         restore_rng(self.env.rng, state["env_rng"])
+        self.env.supply.load_state_dict(state["supply"])
 
     def _load_frames(self, frames: int) -> None:
         self._collector.load_state_dict({**self._collector.state_dict(), "frames": frames})  # type: ignore[arg-type]
