@@ -41,7 +41,7 @@ __all__ = [
 ]
 
 _MODULE_OF = {
-    **dict.fromkeys(("check", "load_run", "monte_carlo"), "pirl_rl.api"),
+    **dict.fromkeys(("load_run", "monte_carlo"), "pirl_rl.api"),
     **dict.fromkeys(("Box", "Plane", "band", "complement", "difference", "intersection", "union"), "pirl_rl.sets"),
     "PIRLLoss": "pirl_rl.losses",
     "generator": "pirl_rl.operators",
@@ -51,8 +51,8 @@ _MODULE_OF = {
 }
 """The module of each name."""
 
-_MODULES = ("problems", "train", "evaluate")
-"""Modules of the package. Those of the commands `train` and `evaluate` can also be called, like the functions."""
+_MODULES = ("problems", "check", "train", "evaluate")
+"""Modules of the package. Those of the commands `check`, `train` and `evaluate` can be called, like the functions."""
 
 
 def __getattr__(name: str) -> Any:

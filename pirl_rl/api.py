@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pirl_rl.assembly import make_evaluation_simulator, make_evaluators
+from pirl_rl.checking import check
 from pirl_rl.commands.console import named_modules, override, quiet_libraries
 from pirl_rl.commands.settings import compose_run, run_folder, typed_settings
 from pirl_rl.commands.train import train_new
@@ -20,7 +21,6 @@ from pirl_rl.evaluation import evaluate as call_evaluators
 from pirl_rl.evaluation import metrics_of
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.problem import check_problem as check
 from pirl_rl.runs.load import Run, load_run
 
 __all__ = ["check", "evaluate", "load_run", "monte_carlo", "train"]

@@ -40,11 +40,15 @@ class TimeSteps(NamedTuple):
     Attributes:
         dt: the length of a control step, in s.
         substeps: the number of integration steps in a control step.
+        moves: the rates of paths across the box and, if they are found, the sets.
+        error: how far ten times as many sub-steps change a control step without noise, in widths of the box.
         reason: the choice and the measured numbers behind it, in whole sentences.
     """
 
     dt: float
     substeps: int
+    moves: list[Move]
+    error: float
     reason: str
 
 
@@ -82,7 +86,7 @@ def propose_time_steps(
         f"In a control step drift and noise move a path by {_parts(moves, chosen)}; the drift's fastest rate is "
         f"{rate:.3g} 1/s; ten times as many integration steps change it by {error:.1g} of the box.",
     )
-    return TimeSteps(chosen, count, " ".join(filter(None, sentences)))
+    return TimeSteps(chosen, count, moves, error, " ".join(filter(None, sentences)))
 
 
 def _samples(problem: ReachAvoidProblem, count: int, seed: int) -> tuple[Tensor, Tensor]:

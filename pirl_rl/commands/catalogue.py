@@ -13,6 +13,7 @@ COMMANDS = (
         "python -m pirl_rl.train +experiment=reach1d",
         "train; settings follow as key=value, and -m sweeps over several values",
     ),
+    ("python -m pirl_rl.check my_module:MyProblem", "find mistakes in your own problem before it is trained"),
     ("python -m pirl_rl.train +experiment=own env.problem._target_=my_module.MyProblem", "train on your own problem"),
     ("python -m pirl_rl.train +experiment=zermelo method=grid", "solve a problem of up to three states on a grid"),
     ("python -m pirl_rl.train resume=RUN_DIR", "resume a run"),

@@ -15,8 +15,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from pirl_rl.assembly import make_trainer
+from pirl_rl.assembly import make_problem, make_trainer
 from pirl_rl.commands.catalogue import choices
+from pirl_rl.commands.check import check_before_training
 from pirl_rl.commands.composition import drop_leftovers, register
 from pirl_rl.commands.console import metrics_table, named_modules, override, quiet_libraries, reported
 from pirl_rl.commands.methods import check_method
@@ -70,6 +71,9 @@ def train_new(
         check_method(config, overrides)
         trust = [*config.trust, *named_modules(overrides), *trust]
         drop_leftovers(config, overrides, trust)
+        problem = make_problem(config, trust) if problem is None else problem
+        if config.check:
+            check_before_training(config, problem)
         if config.grid is not None:
             return solve(config, folder, overrides, trust, problem)
         trainer = make_trainer(config, folder, trust, problem)

@@ -1,0 +1,82 @@
+"""What the checker found, in sentences that name the method, the place in the user's code and a point."""
+
+from __future__ import annotations
+
+import inspect
+import traceback
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from torch import Tensor
+
+from pirl_rl.problem import ReachAvoidProblem
+
+Level = Literal["error", "warning", "note"]
+
+PACKAGE = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One finding.
+
+    Attributes:
+        level: "error" where training would fail or learn something else, "warning" where it probably would, "note" for
+            a fact that is worth knowing.
+        subject: the class and the method, such as "Boat.drift".
+        message: a whole sentence with what was expected and what was got.
+        place: the user's file and line, or empty where the source is not known.
+        point: coordinates of a state at which it can be seen, or None.
+    """
+
+    level: Level
+    subject: str
+    message: str
+    place: str = ""
+    point: tuple[float, ...] | None = None
+
+    def __str__(self) -> str:
+        place = f" ({self.place})" if self.place else ""
+        point = "" if self.point is None else f" For example at x = [{', '.join(f'{c:.6g}' for c in self.point)}]."
+        return f"{self.subject}{place}: {self.message}{point}"
+
+
+def found(
+    problem: ReachAvoidProblem, level: Level, part: str, message: str, point: Tensor | None = None, place: str = ""
+) -> Finding:
+    """A finding about a method or an attribute of a problem, at a state (n,) if there is one to show."""
+    where = place or source_of(problem, part)
+    coordinates = None if point is None else tuple(point.tolist())
+    return Finding(level, f"{type(problem).__name__}.{part}", message, where, coordinates)
+
+
+def source_of(problem: ReachAvoidProblem, part: str) -> str:
+    """The file and the line of a method or property, or else of the class; empty where there is no source."""
+    method = inspect.getattr_static(type(problem), part, None)
+    function = method.fget if isinstance(method, property) else method
+    if inspect.isfunction(function):
+        return f"{Path(function.__code__.co_filename).name}, line {function.__code__.co_firstlineno}"
+    try:
+        file, line = inspect.getsourcefile(type(problem)), inspect.getsourcelines(type(problem))[1]
+    except (OSError, TypeError):  # a class of an interactive session
+        return ""
+    return f"{Path(file or '').name}, line {line}"
+
+
+def raised_in(error: BaseException) -> str:
+    """The file and the line of the innermost frame of an exception that belongs to the problem's module."""
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        path = Path(frame.filename)
+        in_package = path.resolve().is_relative_to(PACKAGE) and path.parent.name != "problems"
+        if "site-packages" not in path.parts and not in_package:
+            return f"{path.name}, line {frame.lineno}"
+    return ""
+
+
+def report(findings: Iterable[Finding], levels: Iterable[Level] = ("error", "warning", "note")) -> str:
+    """The findings of the given levels, one line each, the errors first."""
+    order, kept = {"error": 0, "warning": 1, "note": 2}, {*levels}
+    chosen = sorted((finding for finding in findings if finding.level in kept), key=lambda f: order[f.level])
+    return "\n".join(f"{finding.level:<8} {finding}" for finding in chosen)

@@ -1,0 +1,88 @@
+"""Checks of the target and the avoid set: whether they are found, where they lie, and how large they are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+
+from pirl_rl.checking.findings import Finding, found
+from pirl_rl.checking.samples import Samples, defines
+from pirl_rl.descent import descended
+from pirl_rl.errors import ProblemError
+from pirl_rl.sampling.faces import find_faces
+from pirl_rl.sampling.initial_states import sample_interior
+
+STARTS = 64
+"""The number of states from which points of a set in the box are searched."""
+
+MOST = 0.95
+"""The share of the box from which a set is suspected to have the wrong sign."""
+
+
+def agreement(samples: Samples) -> Iterator[Finding]:
+    """A set that is given by one level and by several must be the same set."""
+    problem, x = samples.problem, samples.x
+    for which, holds in (("target", torch.all), ("avoid", torch.any)):
+        level, constraints = f"{which}_level", f"{which}_constraints"
+        if not (defines(problem, level) and defines(problem, constraints)):
+            continue
+        differs = (getattr(problem, level)(x) <= 0) != holds(getattr(problem, constraints)(x) <= 0, -1)
+        if differs.any():
+            message = f"it gives another set than {constraints}; define one of the two."
+            yield found(problem, "error", level, message, x[differs][0])
+
+
+def sizes(samples: Samples) -> Iterator[Finding]:
+    """Neither set may fill the box, and most of it should be outside both."""
+    problem = samples.problem
+    for what, part, inside in _sets(samples):
+        share = float(inside.double().mean())
+        if share >= MOST:
+            message = f"the {what} fills {share:.0%} of the box; its level must be <= 0 inside and > 0 outside the set."
+            yield found(problem, "warning", part, message)
+    try:
+        sample_interior(problem, problem.states, 1, torch.Generator().manual_seed(0), torch.float64)
+    except ProblemError:
+        message = "expected states outside the target and the avoid set, at which episodes start, got none in the box."
+        yield found(problem, "error", "states", message)
+
+
+def places(samples: Samples) -> Iterator[Finding]:
+    """Both sets must exist near the box, and should overlap it."""
+    problem = samples.problem
+    try:
+        faces = find_faces(problem, torch.Generator().manual_seed(0))
+    except ProblemError as error:
+        part = _part(samples, "avoid" if "of the avoid set" in str(error) else "target")
+        yield found(problem, "error", part, f"{error}".partition(": ")[2] + ".")
+        return
+    # The descent stays in a box twice as wide as the one that it is given.
+    rng, narrow = torch.Generator().manual_seed(0), problem.states.expand(0.505)
+    for what, part, inside in _sets(samples):
+        levels = problem.reached_constraints if what == "target" else problem.avoid_level
+        lowest = descended(lambda x, levels=levels: levels(x).reshape(len(x), -1), narrow.sample(STARTS, rng), narrow)
+        absorbs = problem.reached if what == "target" else problem.failed
+        own = faces.points[faces.values.round() == (what == "target")]
+        seen = (inside.any(), absorbs(lowest).any(), problem.states.expand(1.01).contains(own).any())
+        if not any(seen):
+            message = (
+                f"the {what} lies outside the box of states, in which paths start and V is learned; widen the box "
+                "until it touches the set."
+            )
+            yield found(problem, "warning", part, message, own[0] if len(own) else None)
+
+
+def _sets(samples: Samples):
+    """Each set that absorbs: its name, the method that defines it, and which of the states lie in it."""
+    problem, x = samples.problem, samples.x
+    if problem.objective == "reach-avoid":
+        yield "target", _part(samples, "target"), problem.reached(x)
+    if problem.has_avoid_set:
+        yield "avoid set", _part(samples, "avoid"), problem.failed(x)
+
+
+def _part(samples: Samples, which: str) -> str:
+    """The method by which the class defines a set."""
+    names = (f"{which}_level", f"{which}_constraints")
+    return next((name for name in names if defines(samples.problem, name)), names[0])

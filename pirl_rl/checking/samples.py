@@ -1,0 +1,60 @@
+"""The states and controls at which a problem is checked, and its methods as functions of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import islice, product
+
+import torch
+from torch import Tensor
+
+from pirl_rl.problem import ReachAvoidProblem
+
+STATES = 1_024
+"""The number of random states in the box, and of those in the box that is half as wide again."""
+
+CORNERS = 64
+"""The largest number of corners of the box that are added."""
+
+BEYOND = 1.5
+"""Widths of the box that paths are taken to reach, in widths of `states`."""
+
+LEVELS = ("target_level", "target_constraints", "avoid_level", "avoid_constraints")
+
+Function = Callable[[Tensor, Tensor], Tensor]
+
+
+class Samples:
+    """States in and around the box, controls, and the methods that a problem defines.
+
+    Attributes:
+        problem: the problem.
+        x: states (N, n) in the box, with its centre and corners, float64.
+        u: controls (N, m), half of them vertices.
+        beyond: states (N, n) in the wider box, of which most lie outside `states`.
+        methods: the methods that the problem defines, as functions of x and u, by name.
+    """
+
+    def __init__(self, problem: ReachAvoidProblem, seed: int = 0):
+        rng, states = torch.Generator().manual_seed(seed), problem.states
+        corners = torch.tensor([*islice(product((-1.0, 1.0), repeat=states.dim), CORNERS)], dtype=torch.float64)
+        special = states.wrap(states.denormalize(torch.cat([torch.zeros(1, states.dim).double(), corners])))
+        self.problem = problem
+        self.x = torch.cat([states.sample(STATES, rng, torch.float64), special])
+        self.beyond = states.expand(BEYOND).sample(len(self.x), rng, torch.float64)
+        action = 2 * torch.rand(len(self.x), problem.controls.dim, generator=rng, dtype=torch.float64) - 1
+        action[::2] = action[::2].sign()
+        self.u = problem.controls.denormalize(action)
+        self.methods: dict[str, Function] = {"drift": problem.drift, "diffusion": problem.diffusion}
+        for name in (*LEVELS, "unreachable"):
+            if defines(problem, name):
+                self.methods[name] = _of_states(getattr(problem, name))
+
+
+def defines(problem: ReachAvoidProblem, name: str) -> bool:
+    """Whether the class of a problem defines a method itself."""
+    return getattr(type(problem), name) is not getattr(ReachAvoidProblem, name)
+
+
+def _of_states(method: Callable[[Tensor], Tensor]) -> Function:
+    return lambda x, u: method(x)

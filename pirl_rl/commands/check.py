@@ -1,0 +1,94 @@
+"""Check a problem before it is trained: `python -m pirl_rl.check my_module:MyProblem [dt=0.01] [substeps=4]`.
+
+Finds mistakes in the methods of a problem, its sets and its units, in seconds, and names the method, the line and a
+state at which each can be seen. Ends with exit code 1 where there is an error. Training starts with the same check,
+unless it is given check=false.
+
+    my_module:MyProblem  the class, in a module that Python finds from the current directory
+    dt                   the control step with which the problem will be simulated, in s; by default the proposed one
+    substeps             the number of integration steps in a control step; by default the proposed number
+    key=value            any other setting is an argument of the class
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from pirl_rl.checking import Finding, examine, report
+from pirl_rl.commands.console import quiet_libraries, reported
+from pirl_rl.errors import ConfigError, ProblemError
+from pirl_rl.problem import ReachAvoidProblem
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if {"-h", "--help"} & {*arguments}:
+        print(__doc__)
+        return
+    quiet_libraries()
+    with reported(Path()):
+        named = [text for text in arguments if "=" not in text]
+        if len(named) != 1:
+            raise ConfigError(f"expected one problem, as in python -m pirl_rl.check my_module:MyProblem, got {named}")
+        settings: Any = OmegaConf.to_container(OmegaConf.from_dotlist([text for text in arguments if "=" in text]))
+        steps = {name: settings.pop(name) for name in ("dt", "substeps") if name in settings}
+        problem = _problem(named[0], settings)
+        started = time.perf_counter()
+        findings = examine(problem, **steps)
+    print(_outcome(problem, findings, time.perf_counter() - started))
+    if text := report(findings):
+        print(text)
+    if any(finding.level == "error" for finding in findings):
+        sys.exit(1)
+
+
+def check_before_training(config: DictConfig, problem: ReachAvoidProblem) -> None:
+    """Print the warnings about a problem, with the time steps of a configuration.
+
+    Raises:
+        ProblemError: if the problem has errors; the message lists them.
+    """
+    # The word `auto` leaves a step to the package, and an environment of one's own may have no such setting.
+    dt, substeps = (None if isinstance(value := config.env.get(name), str) else value for name in ("dt", "substeps"))
+    findings = examine(problem, dt, substeps)
+    if errors := report(findings, ["error"]):
+        raise ProblemError(errors.replace("error", "", 1).strip())
+    if warnings := report(findings, ["warning"]):
+        print(warnings, flush=True)
+
+
+def _problem(named: str, settings: dict[str, Any]) -> ReachAvoidProblem:
+    """The problem `my_module:MyProblem`, with arguments of its class.
+
+    Raises:
+        ConfigError: there is no such module or class, or it does not take the arguments.
+    """
+    module, _, name = named.partition(":")
+    sys.path.insert(0, "")
+    try:
+        kind = getattr(importlib.import_module(module), name)
+    except ModuleNotFoundError as error:
+        if error.name != module.partition(".")[0] and error.name != module:
+            raise
+        raise ConfigError(f"{named}: expected a module that Python finds from here, got no module {module!r}") from None
+    except (AttributeError, ValueError):
+        raise ConfigError(f"{named}: expected my_module:MyProblem, but {module} has no class {name!r}") from None
+    if not (isinstance(kind, type) and issubclass(kind, ReachAvoidProblem)):
+        raise ConfigError(f"{named}: expected a subclass of pirl_rl.ReachAvoidProblem, got {kind!r}")
+    try:
+        return kind(**settings)
+    except TypeError as error:
+        raise ConfigError(f"{named}: {error}") from None
+
+
+def _outcome(problem: ReachAvoidProblem, findings: list[Finding], seconds: float) -> str:
+    counts = [(level, sum(finding.level == level for finding in findings)) for level in ("error", "warning", "note")]
+    words = ", ".join(f"{count} {level}{'s' * (count != 1)}" for level, count in counts)
+    return f"{type(problem).__name__}: {words} in {seconds:.1f} s"
