@@ -17,6 +17,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from pirl_rl.arguments import Policy
 from pirl_rl.problem import has_controlled_noise
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
@@ -89,6 +90,25 @@ def value_ahead(
         return ahead + length * (sigma * (curvature @ sigma)).sum((-2, -1)) / 2
 
     return value
+
+
+def look_ahead_policy(solution: Solution, simulator: Simulator, steps: int, levels: int) -> Policy:
+    """The policy that takes the control with the largest V some control steps ahead, see `value_ahead`.
+
+    Args:
+        solution: gives V, and the policy at which the search starts and which it follows after the first step.
+        simulator: simulates the control steps.
+        steps: the number of control steps, at least 1.
+        levels: each coordinate of the control has this many candidates, evenly spaced over its range, at least 2.
+    """
+    controls = solution.problem.controls
+
+    def policy(tau: Tensor, x: Tensor) -> Tensor:
+        marks = torch.linspace(-1, 1, levels, device=x.device).to(x.dtype)
+        start = controls.normalize(solution.policy(tau, x))
+        return controls.denormalize(ascend(value_ahead(solution, simulator, tau, x, steps), start, marks)[0])
+
+    return policy
 
 
 def ascend(objective: Objective, action: Tensor, levels: Tensor, sweeps: int = 1) -> tuple[Tensor, Tensor]:

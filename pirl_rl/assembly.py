@@ -30,7 +30,11 @@ AUTO = "auto"
 UPDATES_PER_DIMENSION, MOST_UPDATES = 3_000, 20_000
 """The number of updates that is chosen for each dimension of (tau, x), and the largest that is chosen."""
 
-PATHS = {("success", "episodes"): (10_000, 1_000), ("calibration", "rollouts"): (256, 16)}
+PATHS = {
+    ("success", "episodes"): (10_000, 1_000),
+    ("calibration", "rollouts"): (256, 16),
+    ("verdict", "rollouts"): (64, 8),
+}
 """Numbers of paths of evaluators, by evaluator and argument: the largest and the smallest that are chosen."""
 
 CHEAP_PATH = 10_000

@@ -3,7 +3,7 @@
 .hydra/config.yaml      the configuration, with the number of its format
 .hydra/overrides.yaml   the overrides of the command line
 metrics.csv             one row of metrics for each logged update
-summary.json            the metrics of the final evaluation, and the length of the training
+summary.json            the verdict, the metrics of the final evaluation, and the length of the training
 evaluation.json         the metrics of a later `python -m pirl_rl.evaluate`
 checkpoints/            last.pt, from which the run can be resumed, and weights-<update>.pt with the networks
 grid.npz                the value and the policy on a mesh, in place of checkpoints, of a run with method=grid
@@ -12,6 +12,7 @@ figures/                PNG files
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
@@ -46,6 +47,18 @@ class RunDirectory:
 
     def __str__(self) -> str:
         return str(self.path)
+
+    def numbers(self) -> dict[str, float]:
+        """The entries of summary.json that are numbers, without the verdict's words.
+
+        Raises:
+            OSError: the file cannot be read.
+            ValueError: it is no JSON object.
+        """
+        entries = json.loads(self.summary.read_text(encoding="utf-8"))
+        if not isinstance(entries, dict):
+            raise ValueError(f"{self.summary}: expected a JSON object, got {type(entries).__name__}")
+        return {name: value for name, value in entries.items() if not isinstance(value, str)}
 
     @property
     def config(self) -> Path:

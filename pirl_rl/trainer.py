@@ -15,7 +15,7 @@ from pirl_rl import checkpoint
 from pirl_rl.collectors import TransitionCollector
 from pirl_rl.curriculum import Curriculum, Stage, StageSettings
 from pirl_rl.errors import ArgumentError, DivergenceError, Interrupted
-from pirl_rl.evaluation import Evaluator, Evidence, evaluate, metrics_of
+from pirl_rl.evaluation import Evaluator, Evidence, evaluate, metrics_of, statements_of
 from pirl_rl.files import replacing
 from pirl_rl.guard import Rollback
 from pirl_rl.learner import Learner
@@ -211,7 +211,7 @@ class Trainer:
 
     def _finish(self) -> dict[str, float]:
         self.evidence = evaluate(self.solution, self.simulator, self.final)
-        summary = {
+        summary: dict[str, float] = {
             "updates": self.update,
             "wall_seconds": self.wall_seconds,
             "updates_per_second": self.update / self.wall_seconds if self.update else 0.0,
@@ -220,7 +220,7 @@ class Trainer:
         }
         if self.folder is not None:
             with replacing(RunDirectory(self.folder).summary) as file:
-                file.write(json.dumps(summary, indent=2) + "\n")
+                file.write(json.dumps(statements_of(self.evidence) | summary, indent=2) + "\n")
         return summary
 
     def save(self, keep_weights: bool = False) -> None:

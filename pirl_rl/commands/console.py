@@ -35,6 +35,18 @@ def quiet_libraries() -> None:
     warnings.filterwarnings("ignore", category=FutureWarning, module=r"(torch|tensordict|torchrl)\b")
 
 
+def outcome(lines: Sequence[str], summary: Mapping[str, float], meanings: Mapping[str, str], verbose: bool) -> str:
+    """What a command prints at its end: the verdict, and the table of all metrics if it is asked for.
+
+    Without a verdict the table is printed in any case.
+    """
+    if not lines:
+        return metrics_table(summary, meanings)
+    if verbose:
+        return "\n".join([metrics_table(summary, meanings), *lines, ""])
+    return "\n".join(["", *lines, "metrics   verbose=true prints all of them with their meaning", ""])
+
+
 def metrics_table(summary: Mapping[str, float], meanings: Mapping[str, str]) -> str:
     """A table of the entries of a summary, with the meanings of the metrics among them."""
     rows = []

@@ -1,7 +1,8 @@
 """Evaluate a run again: `python -m pirl_rl.evaluate run=RUN_DIR [evaluation.success.episodes=100000 ...]`.
 
-Calls the final evaluators of the run, with the changed settings, writes their metrics to `evaluation.json` in the run
-directory, and draws its figures.
+Calls the final evaluators of the run, with the changed settings, writes their metrics and the verdict to
+`evaluation.json` in the run directory, and draws its figures. With verbose=true it prints all metrics with their
+meaning.
 """
 
 from __future__ import annotations
@@ -12,10 +13,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pirl_rl.assembly import make_evaluation_simulator, make_evaluators
-from pirl_rl.commands.console import metrics_table, named_modules, override, reported
+from pirl_rl.commands.console import named_modules, outcome, override, reported
 from pirl_rl.configuration import load_config
 from pirl_rl.errors import ConfigError
-from pirl_rl.evaluation import evaluate, meanings_of, metrics_of
+from pirl_rl.evaluation import evaluate, lines_of, meanings_of, metrics_of, statements_of
 from pirl_rl.figures import draw_run
 from pirl_rl.files import replacing
 from pirl_rl.run_directory import RunDirectory
@@ -45,9 +46,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         evidence = evaluate(solution, make_evaluation_simulator(config, solution.problem), evaluators)
         metrics = metrics_of(evidence)
         with replacing(run.evaluation) as file:
-            file.write(json.dumps(metrics, indent=2) + "\n")
+            file.write(json.dumps(statements_of(evidence) | metrics, indent=2) + "\n")
         figures = draw_run(solution, run.metrics, run.figures, evidence)
-    print(metrics_table(metrics, meanings_of(evaluators, solution.problem)))
+    meanings = meanings_of(evaluators, solution.problem)
+    print(outcome(lines_of(evidence), metrics, meanings, config.get("verbose", False)))
     for figure in figures:
         print(f"figure   {figure}")
     print(f"written  {run.evaluation}")

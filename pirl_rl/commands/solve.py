@@ -19,9 +19,9 @@ from pirl_rl.assembly import (
     make_grid_solver,
     make_problem,
 )
-from pirl_rl.commands.console import metrics_table
+from pirl_rl.commands.console import outcome
 from pirl_rl.configuration import save_config
-from pirl_rl.evaluation import evaluate, meanings_of, metrics_of
+from pirl_rl.evaluation import evaluate, lines_of, meanings_of, metrics_of, statements_of
 from pirl_rl.figures import draw_run
 from pirl_rl.files import replacing
 from pirl_rl.problem import ReachAvoidProblem, check_problem
@@ -73,8 +73,9 @@ def solve(
     summary = {"wall_seconds": seconds, "grid_nodes": float(np.prod(solution.mesh.shape)), **error}
     summary |= metrics_of(evidence)
     with replacing(run.summary) as file:
-        file.write(json.dumps(summary, indent=2) + "\n")
-    print(metrics_table(summary, MEANINGS | meanings_of(evaluators, problem)))
+        file.write(json.dumps(statements_of(evidence) | summary, indent=2) + "\n")
+    meanings = MEANINGS | meanings_of(evaluators, problem)
+    print(outcome(lines_of(evidence), summary, meanings, config.verbose))
     for figure in draw_run(solution, run.metrics, run.figures, evidence):
         print(f"figure   {figure}")
     print(f"run      {run}")

@@ -19,13 +19,13 @@ from pirl_rl.assembly import make_problem, make_trainer
 from pirl_rl.commands.catalogue import choices
 from pirl_rl.commands.check import check_before_training
 from pirl_rl.commands.composition import drop_leftovers, register
-from pirl_rl.commands.console import metrics_table, named_modules, override, quiet_libraries, reported
+from pirl_rl.commands.console import named_modules, outcome, override, quiet_libraries, reported
 from pirl_rl.commands.methods import check_method
 from pirl_rl.commands.solve import solve
 from pirl_rl.configuration import CONF, load_config, save_config
 from pirl_rl.continuation import restore, start_from
 from pirl_rl.errors import INTERRUPTED, ConfigError
-from pirl_rl.evaluation import meanings_of
+from pirl_rl.evaluation import lines_of, meanings_of
 from pirl_rl.figures import draw_run
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.run_directory import RunDirectory
@@ -85,7 +85,7 @@ def train_new(
             config.start = str(start_from(trainer, config.start))
         save_config(config, folder)
         OmegaConf.save(overrides, RunDirectory(folder).overrides)
-        return _train(trainer)
+        return _train(trainer, config.verbose)
 
 
 def resume(folder: Path, overrides: Sequence[str]) -> None:
@@ -103,14 +103,15 @@ def resume(folder: Path, overrides: Sequence[str]) -> None:
         trainer = make_trainer(config, folder, [*config.trust, *named_modules(overrides)])
         restore(trainer)
         save_config(config, folder)
-        _train(trainer)
+        _train(trainer, config.get("verbose", False))
 
 
-def _train(trainer: Trainer) -> dict[str, float]:
+def _train(trainer: Trainer, verbose: bool) -> dict[str, float]:
     summary = trainer.train()
     assert trainer.folder is not None
     run = RunDirectory(trainer.folder)
-    print(metrics_table(summary, meanings_of(trainer.final, trainer.solution.problem)))
+    meanings = meanings_of(trainer.final, trainer.solution.problem)
+    print(outcome(lines_of(trainer.evidence), summary, meanings, verbose))
     for figure in draw_run(trainer.solution, run.metrics, run.figures, trainer.evidence):
         print(f"figure   {figure}")
     print(f"run      {run}")

@@ -7,12 +7,22 @@ in `pirl_rl.figures`.
 
 from pirl_rl.evaluation.accuracy import Accuracy
 from pirl_rl.evaluation.calibration import Calibration
-from pirl_rl.evaluation.evaluator import Evaluator, Evidence, Metrics, evaluate, meanings_of, metrics_of
+from pirl_rl.evaluation.evaluator import (
+    Evaluator,
+    Evidence,
+    Metrics,
+    evaluate,
+    lines_of,
+    meanings_of,
+    metrics_of,
+    statements_of,
+)
 from pirl_rl.evaluation.exact_error import ExactError
 from pirl_rl.evaluation.residuals import Residuals
 from pirl_rl.evaluation.rollouts import Rollouts
 from pirl_rl.evaluation.slices import Slices
 from pirl_rl.evaluation.success import Success
+from pirl_rl.evaluation.verdict import Verdict
 
 __all__ = [
     "Accuracy",
@@ -25,7 +35,10 @@ __all__ = [
     "Rollouts",
     "Slices",
     "Success",
+    "Verdict",
     "evaluate",
+    "lines_of",
     "meanings_of",
     "metrics_of",
+    "statements_of",
 ]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
@@ -63,3 +63,27 @@ def metrics_of(evidence: Mapping[str, Evidence]) -> dict[str, float]:
 def meanings_of(evaluators: Mapping[str, Evaluator], problem: ReachAvoidProblem) -> dict[str, str]:
     """The meanings of all metrics that the evaluators have for a problem, by metric."""
     return {name: text for evaluator in evaluators.values() for name, text in evaluator.meanings(problem).items()}
+
+
+@runtime_checkable
+class Judged(Protocol):
+    """Evidence that says in words what it means."""
+
+    def statements(self) -> dict[str, str]:
+        """Sentences for the summary, by name."""
+        ...
+
+    def lines(self) -> list[str]:
+        """Lines for a person."""
+        ...
+
+
+def statements_of(evidence: Mapping[str, Evidence]) -> dict[str, str]:
+    """The statements of all evidence that has some, in one dictionary."""
+    judged = [entry for entry in evidence.values() if isinstance(entry, Judged)]
+    return {name: text for entry in judged for name, text in entry.statements().items()}
+
+
+def lines_of(evidence: Mapping[str, Evidence]) -> list[str]:
+    """The lines of all evidence that has some."""
+    return [line for entry in evidence.values() if isinstance(entry, Judged) for line in entry.lines()]

@@ -121,12 +121,21 @@ def monte_carlo(
 
 @torch.no_grad()
 def mean_payoff(
-    simulator: Simulator, policy: Policy, tau: Tensor, x: Tensor, rollouts: int, rng: torch.Generator
+    simulator: Simulator,
+    policy: Policy,
+    tau: Tensor,
+    x: Tensor,
+    rollouts: int,
+    rng: torch.Generator,
+    refinement: int = 1,
 ) -> Tensor:
-    """Mean payoff (N,), float64, of paths from tau (N,) and x (N, n); the arguments are those of `monte_carlo`."""
+    """Mean payoff (N,), float64, of paths from tau (N,) and x (N, n); the arguments are those of `monte_carlo`.
+
+    With `refinement`, each control step is split into so many, without another compilation of the simulator.
+    """
     x = simulator.problem.states.wrap(x)
     known, value = _known(simulator.problem, tau, x)
-    steps = simulator.clock.split(tau)[0].clamp(min=1)
+    steps = refinement * simulator.clock.split(tau)[0].clamp(min=1)
     unknown = (~known).nonzero().squeeze(-1)
     if simulator.compile is None and rollouts * simulator.substeps * int(steps[unknown].sum()) >= COMPILED_FROM:
         simulator = simulator.compiled

@@ -185,7 +185,7 @@ def read_result(task: Task) -> Result:
         # Later prompts quote the reason, and paths of this machine do not belong into a prompt.
         reason = re.sub(r"\S*/\S*", "<path>", last)[:300]
         return _result(task, task.updates, status="failed", reason=f"exit code {failure['exit_code']}: {reason}")
-    summary = json.loads(task.run.summary.read_text(encoding="utf-8"))
+    summary = task.run.numbers()
     metrics = {name: value for name, value in summary.items() if name not in TIMES and math.isfinite(value)}
     if missing := [name for name in JUDGED if name not in metrics]:
         reason = f"{', '.join(missing)}: expected a finite number, got {summary.get(missing[0])}"

@@ -6,7 +6,6 @@ python -m pirl_rl.compare DIR [DIR ...] [--out FOLDER]
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -97,7 +96,7 @@ def read_run(path: Path) -> RunRecord:
     try:
         config = OmegaConf.load(run.config)
         names = [OmegaConf.select(config, key, throw_on_missing=True) for key in ("experiment_name", "method_name")]
-        summary = json.loads(run.summary.read_text())
+        summary = run.numbers()
         metrics = read_metrics(run.metrics)
     except (OSError, ValueError, OmegaConfBaseException) as error:
         raise RunError(f"{path} cannot be read: {error}") from error

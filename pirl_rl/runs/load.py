@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pirl_rl import checkpoint
 from pirl_rl.arguments import checked_points
-from pirl_rl.ascent import ascend, value_ahead
+from pirl_rl.ascent import look_ahead_policy
 from pirl_rl.assembly import make_networks, make_problem, make_simulator
 from pirl_rl.checkpoint import check_module
 from pirl_rl.configuration import load_config
@@ -88,14 +88,9 @@ class Run:
             raise ArgumentError(
                 "policy: expected lookahead=0 for a grid, whose policy is already the best of its candidates"
             )
-
-        def ahead(times: Tensor, state: Tensor) -> Tensor:
-            controls, marks = self.problem.controls, torch.linspace(-1, 1, levels, device=state.device).to(state.dtype)
-            start = controls.normalize(self.solution.policy(times, state))
-            objective = value_ahead(self.solution, self.simulator, times, state, lookahead)
-            return controls.denormalize(ascend(objective, start, marks)[0])
-
-        return self._call(ahead if lookahead else self.solution.policy, tau, x)
+        if not lookahead:
+            return self._call(self.solution.policy, tau, x)
+        return self._call(look_ahead_policy(self.solution, self.simulator, lookahead, levels), tau, x)
 
     def reach_avoid_set(self, p: float, tau: float) -> Callable:
         """The set {x : V(tau, x) > p}, Eq. (ra_levelset), as a function that maps states (*, n) to (*) bool."""

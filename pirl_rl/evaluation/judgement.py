@@ -1,0 +1,204 @@
+"""The verdict on a solution: rules that turn what was measured into solved, doubtful or failed, and sentences.
+
+Differences of success are compared with their standard error, so that a verdict does not hang on noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+Level = Literal["solved", "doubtful", "failed"]
+
+NEVER = 0.005
+"""A mean success below this counts as never."""
+
+GAP, LARGE_GAP = 0.03, 0.10
+"""Mean errors of V, without the noise of Monte Carlo, above which a solution is doubtful, and above which it failed."""
+
+BIAS = 0.02
+"""A mean of V - Monte Carlo beyond this, in either direction, is doubtful."""
+
+BETTER = 0.02
+"""The mean success by which another policy, or another time step, must differ to matter."""
+
+ERRORS = 3.0
+"""The number of standard errors by which a difference must exceed 0 to matter."""
+
+FLAT, VARIED = 0.01, 0.05
+"""Standard deviations over the states: below the first V is constant, above the second success varies."""
+
+
+class Difference(NamedTuple):
+    """A mean difference of success at the same states, and its standard error."""
+
+    mean: float
+    error: float
+
+    def matters(self, least: float = BETTER) -> bool:
+        return abs(self.mean) > max(least, ERRORS * self.error)
+
+
+class Reason(NamedTuple):
+    """Why a solution is not solved, and what to do next."""
+
+    level: Literal["doubtful", "failed"]
+    why: str
+    advice: str
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What a verdict rests on; probabilities are means over the same states and times to go.
+
+    Attributes:
+        success: of the learned policy.
+        low, high: the 95% interval of `success`.
+        random: success of random controls.
+        constant: success of the best constant control.
+        constant_control: that control, in SI units.
+        over_constant: constant minus learned, with its error.
+        ahead: look-ahead minus learned; None where it was not played.
+        finer: success with shorter time steps minus that with those of the training.
+        gap: the mean of |V - Monte Carlo|.
+        noise: what `gap` would be for a perfect V.
+        gap_finer, noise_finer: like `gap` and `noise`, with shorter time steps.
+        bias: the mean of V - Monte Carlo.
+        value_spread, success_spread: standard deviations of V and of Monte Carlo over the states.
+        still: numbers of the controls that never move.
+        gain: the largest gain of V per s that the HJB residual promises for another control, over the states.
+        gain_at: the state of `gain`.
+        invariance: whether the problem asks to stay out of the avoid set.
+    """
+
+    success: float
+    low: float
+    high: float
+    random: float
+    constant: float
+    constant_control: list[float]
+    over_constant: Difference
+    ahead: Difference | None
+    finer: Difference
+    gap: float
+    noise: float
+    gap_finer: float
+    noise_finer: float
+    bias: float
+    value_spread: float
+    success_spread: float
+    still: list[int]
+    gain: float
+    gain_at: list[float]
+    invariance: bool = False
+
+    @property
+    def error(self) -> float:
+        """The mean error of V without the noise of Monte Carlo, whose squares add up."""
+        return max(self.gap**2 - self.noise**2, 0.0) ** 0.5
+
+
+def judge(m: Measures) -> list[Reason]:
+    """The reasons against a solution, the gravest first; none if it is solved."""
+    reasons = [*_failures(m)]
+    if not any(reason.level == "failed" for reason in reasons):
+        reasons += _doubts(m)
+    return reasons
+
+
+def _failures(m: Measures):
+    if not all(number == number for number in (m.success, m.gap, m.value_spread)):
+        yield Reason("failed", "V or the policy is not a number.", "lower learner.learning_rate, and check the problem")
+        return
+    if m.high < NEVER or m.success == 0:
+        event = "stays out of the avoid set" if m.invariance else "reaches the target"
+        others = max(m.random, m.constant)
+        also = "nor does a random or a constant control" if others < NEVER else f"while another reaches {others:.3f}"
+        yield Reason(
+            "failed",
+            f"The learned policy never {event}, {also}.",
+            "check the sets with python -m pirl_rl.check, and that the horizon suffices",
+        )
+    if m.over_constant.mean > 0 and m.over_constant.matters():
+        control = _numbers(m.constant_control)
+        yield Reason(
+            "failed",
+            f"The constant control {control} succeeds more often than the learned policy, by "
+            f"{m.over_constant.mean:.3f}.",
+            "train longer (trainer.updates) and from another seed",
+        )
+    if m.value_spread < FLAT and m.success_spread > VARIED:
+        yield Reason(
+            "failed",
+            "V is the same at all states, but success is not.",
+            "lower the weights of the HJB residual and of the boundary (pirl.final), or start them later",
+        )
+    if m.error > LARGE_GAP:
+        yield Reason(
+            "failed",
+            f"V is wrong by {m.error:.2f} on average, measured by Monte Carlo of its own policy.",
+            "look at figures/calibration.png, and train longer (trainer.updates) or with wider networks",
+        )
+
+
+def _doubts(m: Measures):
+    if m.error > GAP or abs(m.bias) > BIAS:
+        sign = "above" if m.bias > 0 else "below"
+        yield Reason(
+            "doubtful",
+            f"V is wrong by {m.error:.3f} on average, and {abs(m.bias):.3f} {sign} Monte Carlo of its own policy.",
+            "train longer (trainer.updates) or with wider networks (critic.hidden)",
+        )
+    if m.ahead is not None and m.ahead.mean > 0 and m.ahead.matters():
+        yield Reason(
+            "doubtful",
+            f"A policy that looks one control step ahead succeeds more often, by {m.ahead.mean:.3f}.",
+            "train longer, or use run.policy(tau, x, lookahead=1)",
+        )
+    if m.finer.matters():
+        yield Reason(
+            "doubtful",
+            f"With shorter time steps success changes by {m.finer.mean:+.3f}.",
+            "take a smaller env.dt, or env.dt=auto",
+        )
+
+
+def describe(m: Measures, reasons: list[Reason]) -> list[str]:
+    """At most eight lines for a person."""
+    level, why = verdict_of(reasons)
+    lines = [f"verdict   {level}: {why}"]
+    if len(reasons) > 1:
+        lines.append(f"          {' '.join(reason.why for reason in reasons[1:])}")
+    ahead = "" if m.ahead is None else f", one step of look-ahead {m.success + m.ahead.mean:.3f}"
+    lines.append(f"success   {m.success:.3f} of the learned policy, 95% interval {m.low:.3f} to {m.high:.3f}")
+    lines.append(
+        f"beside    random controls {m.random:.3f}, the best constant one, {_numbers(m.constant_control)}, "
+        f"{m.constant:.3f}{ahead}"
+    )
+    lines.append(
+        f"value     mean |V - Monte Carlo| {m.gap:.4f}, of which noise {m.noise:.4f}; with shorter steps "
+        f"{m.gap_finer:.4f}, of which noise {m.noise_finer:.4f}"
+    )
+    lines.append(
+        f"residual  another control raises V by up to {m.gain:.3g} per s, most at x = {_numbers(m.gain_at)}"
+        if m.gain > 0
+        else "residual  no other control raises V"
+    )
+    if m.still:
+        names = f"component {m.still[0]}" if len(m.still) == 1 else f"components {', '.join(map(str, m.still))}"
+        lines.append(f"control   {names} of the control never move{'s' if len(m.still) == 1 else ''}")
+    if reasons:
+        lines.append(f"next      {'; '.join(dict.fromkeys(reason.advice for reason in reasons))}")
+    return lines
+
+
+def verdict_of(reasons: list[Reason]) -> tuple[Level, str]:
+    """The level and the first reason."""
+    if not reasons:
+        return "solved", "V agrees with simulation of its policy, and no other policy that was tried does better."
+    return reasons[0].level, reasons[0].why
+
+
+def _numbers(values: list[float]) -> str:
+    shown = ", ".join(f"{value:.3g}" for value in values[:6])
+    return f"[{shown}{', ...' if len(values) > 6 else ''}]"

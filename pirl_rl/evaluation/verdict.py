@@ -1,0 +1,171 @@
+"""The measurements behind the verdict on a solution, see `pirl_rl.evaluation.judgement`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pirl_rl.arguments import Policy
+from pirl_rl.ascent import look_ahead_policy
+from pirl_rl.errors import ArgumentError
+from pirl_rl.evaluation.inputs import noise_rng, points_rng
+from pirl_rl.evaluation.judgement import Difference, Measures, describe, judge, verdict_of
+from pirl_rl.evaluation.largest_residual import largest_residual
+from pirl_rl.evaluation.monte_carlo import mean_payoff, wilson_interval
+from pirl_rl.evaluation.other_policies import play_open_loop
+from pirl_rl.grid import GridSolution
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.sampling.initial_states import InitialStates, UniformStates
+from pirl_rl.simulator import Simulator
+from pirl_rl.solution import Solution
+
+FINER = 2
+"""The shorter control step is this part of that of the training."""
+
+FEWER = 4
+"""Of so many states one is used where a path costs this many times as much."""
+
+OPEN_LOOP = 8
+"""The number of paths of each constant control, and of random ones, from each state."""
+
+LEVELS = 3
+"""The number of levels of each control in the search for a better one."""
+
+STILL = 1e-3
+"""A control whose standard deviation over the states is below this share of its half range does not move."""
+
+
+@dataclass(frozen=True)
+class VerdictEvidence:
+    """What was measured, and the reasons that follow from it."""
+
+    measures: Measures
+
+    def metrics(self) -> dict[str, float]:
+        m = self.measures
+        ahead = {} if m.ahead is None else {"success_ahead": m.success + m.ahead.mean}
+        return {
+            "success_learned": m.success,
+            "success_random": m.random,
+            "success_constant": m.constant,
+            **ahead,
+            "success_finer": m.success + m.finer.mean,
+            "value_gap": m.gap,
+            "value_gap_noise": m.noise,
+            "value_gap_finer": m.gap_finer,
+            "value_bias": m.bias,
+        }
+
+    def statements(self) -> dict[str, str]:
+        """The verdict and its reason, for the summary."""
+        reasons = judge(self.measures)
+        level, _ = verdict_of(reasons)
+        return {"verdict": level, "verdict_reason": " ".join(reason.why for reason in reasons) or verdict_of([])[1]}
+
+    def lines(self) -> list[str]:
+        """The verdict in at most eight lines."""
+        return describe(self.measures, judge(self.measures))
+
+
+class Verdict:
+    """Plays the learned policy beside others that need no training, at the same states, and judges the solution.
+
+    Times to go are uniform in (0, T]. Points and noise are the same at every call.
+
+    Args:
+        points: number of states, at least 8.
+        rollouts: number of paths from each state, at least 2.
+        initial_states: distribution of the states; its steps to go are not used. The default is uniform in the box of
+            states, outside A and B.
+        seed: seed of points and noise.
+
+    Raises:
+        ArgumentError: if there are too few points or rollouts.
+    """
+
+    def __init__(
+        self, points: int = 400, rollouts: int = 64, initial_states: InitialStates | None = None, seed: int = 0
+    ):
+        if points < 8 or rollouts < 2:
+            raise ArgumentError(f"Verdict: expected points >= 8 and rollouts >= 2, got {points} and {rollouts}")
+        self.points, self.rollouts, self.seed = points, rollouts, seed
+        self.initial_states = initial_states or UniformStates()
+
+    def meanings(self, problem: ReachAvoidProblem) -> dict[str, str]:
+        where = f"from {self.points:,} states and random times to go, {self.rollouts:,} paths each"
+        return {
+            "success_learned": f"The success of the learned policy {where}.",
+            "success_random": "The success of controls that are drawn at random in each control step, from there.",
+            "success_constant": "The success of the best constant control out of the vertices and the centre of the "
+            "box of controls, from there.",
+            "success_ahead": "The success of the policy that looks one control step ahead, from a part of these "
+            "states, added to success_learned as a difference.",
+            "success_finer": f"The success of the learned policy with control steps that are {FINER} times as short, "
+            "likewise.",
+            "value_gap": "The mean of |V - Monte Carlo| at these states.",
+            "value_gap_noise": "What value_gap would be for a perfect V.",
+            "value_gap_finer": f"Like value_gap, with control steps that are {FINER} times as short.",
+            "value_bias": "The mean of V - Monte Carlo at these states.",
+        }
+
+    def __call__(self, solution: Solution, simulator: Simulator) -> VerdictEvidence:
+        problem, rng = solution.problem, points_rng(self.seed)
+        _, x = self.initial_states.sample(problem, self.points, 1, rng, solution.dtype)
+        fraction = 1 - torch.rand(self.points, generator=rng, dtype=solution.dtype)
+        tau, x = problem.horizon * fraction.to(solution.device), x.to(solution.device)
+        few = slice(0, max(8, self.points // FEWER))
+
+        def play(policy: Policy, rollouts: int, where: slice = slice(None), refinement: int = 1):
+            noise = noise_rng(solution, self.seed)
+            return mean_payoff(simulator, policy, tau[where], x[where], rollouts, noise, refinement).cpu()
+
+        value = solution.value(tau, x).cpu().double()
+        learned = play(solution.policy, self.rollouts)
+        finely = play(solution.policy, max(2, self.rollouts // 2), few, FINER)
+        constant, action, random = play_open_loop(simulator, tau, x, OPEN_LOOP, self.seed)
+        u = problem.controls.normalize(solution.policy(tau, x))
+        ahead, gain, worst = None, 0.0, 0
+        if not isinstance(solution, GridSolution):  # whose policy is the best of its candidates already
+            policy = look_ahead_policy(solution, simulator, 1, LEVELS)
+            ahead = _difference(play(policy, max(2, self.rollouts // FEWER), few), learned[few])
+            gains = largest_residual(solution, tau, x, along := solution.residual(tau, x), LEVELS) - along
+            worst = int(gains.argmax())
+            gain = gains[worst].item()
+        low, high = wilson_interval(learned.mean().item() * self.points * self.rollouts, self.points * self.rollouts)
+        return VerdictEvidence(
+            Measures(
+                success=learned.mean().item(),
+                low=low,
+                high=high,
+                random=random.mean().item(),
+                constant=constant.mean().item(),
+                constant_control=problem.controls.denormalize(action).tolist(),
+                over_constant=_difference(constant, learned),
+                ahead=ahead,
+                finer=_difference(finely, learned[few]),
+                gap=(value - learned).abs().mean().item(),
+                noise=_expected_deviation(learned, self.rollouts),
+                gap_finer=(value[few] - finely).abs().mean().item(),
+                noise_finer=_expected_deviation(finely, max(2, self.rollouts // 2)),
+                bias=(value - learned).mean().item(),
+                value_spread=value.std().item(),
+                success_spread=learned.std().item(),
+                still=(u.std(0) < STILL).nonzero().flatten().tolist(),
+                gain=gain,
+                gain_at=x[worst].tolist(),
+                invariance=problem.objective == "invariance",
+            )
+        )
+
+
+def _difference(other: Tensor, learned: Tensor) -> Difference:
+    """The mean of `other` minus `learned`, success (N,) at the same independent states, and its standard error."""
+    gap = other - learned
+    return Difference(gap.mean().item(), (gap.std() / len(gap) ** 0.5).item())
+
+
+def _expected_deviation(mean: Tensor, rollouts: int) -> float:
+    """The mean absolute deviation of Monte Carlo means (N,), for normal errors: sqrt(2 p (1 - p) / (pi R))."""
+    return (2 * mean * (1 - mean) / (torch.pi * (rollouts - 1))).sqrt().mean().item()
