@@ -33,6 +33,7 @@ UPDATES_PER_DIMENSION, MOST_UPDATES = 3_000, 20_000
 PATHS = {
     ("success", "episodes"): (10_000, 1_000),
     ("calibration", "rollouts"): (256, 16),
+    ("slices", "rollouts"): (16, 1),
     ("verdict", "rollouts"): (64, 8),
 }
 """Numbers of paths of evaluators, by evaluator and argument: the largest and the smallest that are chosen."""

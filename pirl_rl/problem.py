@@ -113,7 +113,7 @@ class ReachAvoidProblem(ABC):
 
     @property
     def planes(self) -> Mapping[str, Plane]:
-        """Sections of the state space for figures, by name; none by default."""
+        """Sections of the state space for figures, by name; without them, figures show planes of coordinates."""
         return {}
 
     # The methods below follow from the sets and the payoff; a subclass has no need to redefine them.

@@ -154,7 +154,7 @@ def test_rollouts_are_drawn_to_their_ends(measured):
     assert np.array([marker[0] for marker in markers[1::2]]) == pytest.approx(ends)
 
 
-def test_a_problem_without_planes_has_nothing_to_show():
+def test_a_problem_with_one_state_has_nothing_to_show():
     solution = Known(Reach1D())
     for evaluator in (Slices(3, 1), Rollouts(1, 3)):
         evidence = evaluator(solution, Simulator(solution.problem))
@@ -167,7 +167,7 @@ def test_evidence_is_among_the_figures_of_a_run(tmp_path):
     simulator = Simulator(solution.problem, dt=0.1, substeps=10, crossing="endpoint")
     evidence = evaluate(solution, simulator, {"slices": Slices(5, 2), "rollouts": Rollouts(2, 5)})
     paths = draw_run(solution, tmp_path / "none.csv", tmp_path / "figures", evidence)
-    assert [path.name for path in paths] == ["slice_walk_angle.png", "rollouts.png"]
+    assert [path.name for path in paths] == ["slice_walk_angle.png", "policy_walk_angle.png", "rollouts.png"]
     assert all(imread(path)[..., :3].std() > 0.01 for path in paths)
 
 

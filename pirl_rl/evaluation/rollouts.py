@@ -1,4 +1,4 @@
-"""Stochastic closed-loop paths from three starts, for a figure in all planes of the problem; they have no metrics."""
+"""Stochastic closed-loop paths from three starts, for a figure in all planes; they have no metrics."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import torch
 
 from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.inputs import noise_rng
+from pirl_rl.evaluation.planes import planes_of
 from pirl_rl.evaluation.slices import Section
 from pirl_rl.evaluation.trajectories import Trajectories, closed_loop
 from pirl_rl.problem import ReachAvoidProblem
@@ -23,8 +24,8 @@ class RolloutsEvidence:
     """Paths of the policy, and V on all planes onto which they are projected.
 
     Attributes:
-        sections: V on every plane; empty for a problem without planes.
-        paths: equally many paths from each start, ordered by start, on the CPU; None for a problem without planes.
+        sections: V on every plane; empty for a problem with one state.
+        paths: equally many paths from each start, ordered by start, on the CPU; None for a problem with one state.
         values: V at the starts.
     """
 
@@ -59,7 +60,7 @@ class Rollouts:
 
     def __call__(self, solution: Solution, simulator: Simulator) -> RolloutsEvidence:
         problem = solution.problem
-        sections = [Section.of(solution, plane, self.points) for plane in problem.planes.values()]
+        sections = [Section.of(solution, plane, self.points) for plane in planes_of(solution).values()]
         if not sections:
             return RolloutsEvidence([], None, [])
         first = sections[0]

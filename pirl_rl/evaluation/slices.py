@@ -10,10 +10,14 @@ from torch import Tensor
 from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.inputs import like, noise_rng
 from pirl_rl.evaluation.monte_carlo import mean_payoff
+from pirl_rl.evaluation.planes import plane_names, planes_of
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sets import Plane
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
+
+OUTLINE = 151
+"""The number of points along each axis of a plane on which the outlines of A and B are found."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +30,7 @@ class Section:
         tau: times to go (k^2,) in s, all equal to the horizon.
         x: states (k^2, n) in SI units, row by row of the grid.
         value: V (k, k); entry [i, j] is at coordinate j of the first axis and i of the second.
+        reached, failed: whether points lie in A and in B, bool, on a grid of `OUTLINE` points along each axis.
     """
 
     plane: Plane
@@ -33,26 +38,43 @@ class Section:
     tau: Tensor
     x: Tensor
     value: Tensor
+    reached: Tensor
+    failed: Tensor
 
     @classmethod
     def of(cls, solution: Solution, plane: Plane, points: int) -> Section:
         """Compute V of a solution on a plane with `points` grid points along each axis."""
-        first, second = (torch.linspace(a, b, points) for a, b in zip(plane.box.low, plane.box.high, strict=True))
-        grid = torch.stack(torch.meshgrid(first, second, indexing="xy"), -1).reshape(-1, 2)
-        tau = torch.full((len(grid),), solution.problem.horizon)
-        tau, x = like(solution, tau, plane.embed(grid.double()))
-        x = solution.problem.states.wrap(x)
+        problem, axes, grid = solution.problem, *_grid(plane, points)
+        tau, x = like(solution, torch.full((len(grid),), problem.horizon), grid)
+        x = problem.states.wrap(x)
         value = solution.value(tau, x).cpu().reshape(points, points)
-        return cls(plane, (first, second), tau, x, value)
+        fine = problem.states.wrap(_grid(plane, OUTLINE)[1])
+        sets = [inside.reshape(OUTLINE, OUTLINE) for inside in (problem.reached(fine), problem.failed(fine))]
+        return cls(plane, axes, tau, x, value, *sets)
+
+
+def _grid(plane: Plane, points: int) -> tuple[tuple[Tensor, Tensor], Tensor]:
+    """The coordinates (k,) along both axes of a plane, and the states (k^2, n), float64, of its grid."""
+    first, second = (torch.linspace(a, b, points) for a, b in zip(plane.box.low, plane.box.high, strict=True))
+    grid = torch.stack(torch.meshgrid(first, second, indexing="xy"), -1).reshape(-1, 2)
+    return (first, second), plane.embed(grid.double())
 
 
 @dataclass(frozen=True)
 class Slice:
-    """Mean payoff (k, k) and projected vector field (k, k, 2) of the learned policy on a section."""
+    """The learned policy on a section.
+
+    Attributes:
+        section: the section.
+        monte_carlo: mean payoffs (k, k).
+        field: the drift of the closed loop in the coordinates of the plane (k, k, 2), per s.
+        action: controls (k, k, m), normalised to [-1, 1].
+    """
 
     section: Section
     monte_carlo: Tensor
     field: Tensor
+    action: Tensor
 
     @property
     def mae(self) -> float:
@@ -75,7 +97,7 @@ class SlicesEvidence:
 
 
 class Slices:
-    """Compares V with rollouts on a grid of each of the problem's planes; a problem without planes has no metrics.
+    """Compares V with rollouts on a grid of each plane, see `planes_of`; with one state there is none.
 
     Args:
         points: number of grid points along each axis, at least 2.
@@ -93,7 +115,7 @@ class Slices:
 
     def meanings(self, problem: ReachAvoidProblem) -> dict[str, str]:
         meanings: dict[str, str] = {}
-        for name in problem.planes:
+        for name in plane_names(problem):
             meanings[f"slice_{name}_mae"] = (
                 f"The mean of |V - Monte Carlo|, the latter the mean payoff of {self.rollouts:,} rollouts of the "
                 f"learned policy, on the {self.points} x {self.points} grid of the plane {name}, edges included, at "
@@ -103,7 +125,7 @@ class Slices:
         return meanings
 
     def __call__(self, solution: Solution, simulator: Simulator) -> SlicesEvidence:
-        planes = solution.problem.planes
+        planes = planes_of(solution)
         return SlicesEvidence({name: self._slice(solution, simulator, plane) for name, plane in planes.items()})
 
     def _slice(self, solution: Solution, simulator: Simulator, plane: Plane) -> Slice:
@@ -111,7 +133,9 @@ class Slices:
         noise = noise_rng(solution, self.seed)
         mean = mean_payoff(simulator, solution.policy, section.tau, section.x, self.rollouts, noise)
         shape = (self.points, self.points)
-        return Slice(section, mean.cpu().reshape(shape), projected_field(solution, section).cpu().reshape(*shape, 2))
+        field = projected_field(solution, section).cpu().reshape(*shape, 2)
+        action = solution.problem.controls.normalize(solution.policy(section.tau, section.x))
+        return Slice(section, mean.cpu().reshape(shape), field, action.cpu().reshape(*shape, -1))
 
 
 def projected_field(solution: Solution, section: Section) -> Tensor:

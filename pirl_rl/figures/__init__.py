@@ -6,6 +6,7 @@ The functions here draw data and return matplotlib figures; `save_figures` write
 from pirl_rl.figures.accuracy import draw_accuracy
 from pirl_rl.figures.evidence import draw, draw_all
 from pirl_rl.figures.files import DPI, FIGURES, save_figures
+from pirl_rl.figures.reliability import draw_calibration
 from pirl_rl.figures.rollouts import draw_rollouts
 from pirl_rl.figures.run import draw_run
 from pirl_rl.figures.slices import draw_slices
@@ -17,6 +18,7 @@ __all__ = [
     "draw",
     "draw_accuracy",
     "draw_all",
+    "draw_calibration",
     "draw_rollouts",
     "draw_run",
     "draw_slices",

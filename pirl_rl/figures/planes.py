@@ -12,6 +12,9 @@ from pirl_rl.sets import Box
 
 CONTOURS = (0.1, 0.5, 0.9)
 
+TARGET, AVOID = "limegreen", "red"
+"""The colours of the outlines of A and B."""
+
 
 def draw_plane(axes: Axes, section: Section, values: Tensor) -> QuadMesh:
     """Draw a heat map and contours of values (k, k) in [0, 1] on a section's grid; returns the heat map."""
@@ -19,9 +22,19 @@ def draw_plane(axes: Axes, section: Section, values: Tensor) -> QuadMesh:
     mesh = axes.pcolormesh(first, second, values.numpy(), cmap="viridis", vmin=0, vmax=1, shading="nearest")
     lines = axes.contour(first, second, values.numpy(), CONTOURS, colors="white", linewidths=1)
     axes.clabel(lines, fontsize="x-small")
+    draw_sets(axes, section)
     axes.set(xlabel=section.plane.axes[0], ylabel=section.plane.axes[1])
     axes.set(xlim=(first[0], first[-1]), ylim=(second[0], second[-1]))
     return mesh
+
+
+def draw_sets(axes: Axes, section: Section) -> None:
+    """Draw the outlines of A and B on a section's grid."""
+    for inside, color in ((section.reached, TARGET), (section.failed, AVOID)):
+        if bool(inside.any()) and not bool(inside.all()):
+            low, high = section.plane.box.low, section.plane.box.high
+            first, second = (np.linspace(a, b, len(inside)) for a, b in zip(low, high, strict=True))
+            axes.contour(first, second, inside.float().numpy(), [0.5], colors=color, linewidths=1.8)
 
 
 def broken_at_seams(path: np.ndarray, box: Box) -> np.ndarray:

@@ -6,6 +6,7 @@ from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
 
 from pirl_rl.evaluation.rollouts import RolloutsEvidence
 from pirl_rl.figures.evidence import draw
@@ -14,7 +15,9 @@ from pirl_rl.figures.planes import broken_at_seams, draw_plane
 BEYOND = "0.5"
 """The colour of the part of a panel beyond the plane's box, where V is not drawn."""
 ENDS = {"reached": ("o", "limegreen"), "failed": ("X", "red"), "out of time": ("s", "white")}
-STARTS = ("white", "gold", "deepskyblue")
+STARTS = ("white", "orange", "deepskyblue")
+OUTLINE = [withStroke(linewidth=1.8, foreground="black")]
+"""A dark edge, without which light paths vanish where V is high and dark ones where it is low."""
 
 
 @draw.register
@@ -23,7 +26,7 @@ def draw_rollouts(evidence: RolloutsEvidence) -> dict[str, Figure]:
     sections, paths, values = evidence.sections, evidence.paths, evidence.values
     if paths is None:
         return {}
-    figure = Figure(figsize=(0.8 + 4.8 * len(sections), 4.8), layout="constrained")
+    figure = Figure(figsize=(max(0.8 + 4.8 * len(sections), 7.0), 5.0), layout="constrained")
     ended = zip(paths.reached.tolist(), paths.failed.tolist(), strict=True)
     ends = ["reached" if reached else "failed" if failed else "out of time" for reached, failed in ended]
     each = len(ends) // len(values)
@@ -34,10 +37,15 @@ def draw_rollouts(evidence: RolloutsEvidence) -> dict[str, Figure]:
         projected = section.plane.project(paths.state).numpy()
         for i, end in enumerate(ends):
             path = projected[: paths.steps[i] + 1, i]
-            axes.plot(*broken_at_seams(path, section.plane.box).T, color=STARTS[i // each], lw=0.8)
+            axes.plot(
+                *broken_at_seams(path, section.plane.box).T, color=STARTS[i // each], lw=0.8, path_effects=OUTLINE
+            )
             axes.plot(*path[0], "D", color=STARTS[i // each], mec="black", mew=0.6, ms=6, zorder=3)
             axes.plot(*path[-1], ENDS[end][0], color=ENDS[end][1], mec="black", mew=0.6, ms=6, zorder=3)
         axes.autoscale()
+    if paths.state.shape[-1] > 2:
+        note = "Coordinates that a plane does not show change along a path; V is that on the plane."
+        figure.suptitle(note, fontsize="small")
     figure.colorbar(mesh, ax=list(all_axes), label=f"learned V, τ = {sections[0].tau[0]:g} s")
     starts = zip(STARTS, values, strict=True)
     handles: list[Artist] = [
@@ -48,5 +56,11 @@ def draw_rollouts(evidence: RolloutsEvidence) -> dict[str, Figure]:
         for end, (marker, color) in ENDS.items()
     ]
     handles.append(Patch(color=BEYOND, label="beyond the plane"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize="small", facecolor="0.7")
+    figure.legend(
+        handles=handles,
+        loc="outside lower center",
+        ncols=min(len(handles), 4 * len(sections)),
+        fontsize="small",
+        facecolor="0.7",
+    )
     return {"rollouts": figure}

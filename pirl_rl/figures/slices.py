@@ -1,4 +1,4 @@
-"""Figures of slices: V, Monte Carlo and the directions of the closed loop on a plane."""
+"""Figures of slices: V with the directions of the closed loop, Monte Carlo, and the policy, on a plane."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from matplotlib.figure import Figure
 
 from pirl_rl.evaluation.slices import Section, Slice, SlicesEvidence
 from pirl_rl.figures.evidence import draw
-from pirl_rl.figures.planes import draw_plane
+from pirl_rl.figures.planes import draw_plane, draw_sets
+
+MOST_CONTROLS = 3
+"""The largest number of components of the control that are drawn."""
 
 ARROWS = 11
 """Largest number of arrows of the vector field along each axis."""
@@ -18,8 +21,9 @@ ARROWS = 11
 
 @draw.register
 def draw_slices(evidence: SlicesEvidence) -> dict[str, Figure]:
-    """One figure for each plane."""
-    return {f"slice_{name}": draw_slice(cut) for name, cut in evidence.slices.items()}
+    """Two figures for each plane: V beside Monte Carlo, and the policy."""
+    slices = {f"slice_{name}": draw_slice(cut) for name, cut in evidence.slices.items()}
+    return slices | {f"policy_{name}": draw_policy_slice(cut) for name, cut in evidence.slices.items()}
 
 
 def draw_slice(cut: Slice) -> Figure:
@@ -33,6 +37,24 @@ def draw_slice(cut: Slice) -> Figure:
         axes.set_title(title)
     _draw_field(left, section, cut.field.numpy())
     figure.colorbar(mesh, ax=(left, right), label="probability")
+    return figure
+
+
+def draw_policy_slice(cut: Slice) -> Figure:
+    """Heat maps of the control, at most `MOST_CONTROLS` components of it, between their bounds."""
+    section = cut.section
+    first, second = (axis.numpy() for axis in section.axes)
+    shown = min(cut.action.shape[-1], MOST_CONTROLS)
+    figure = Figure(figsize=(0.8 + 4.4 * shown, 4.2), layout="constrained")
+    panels = figure.subplots(1, shown, squeeze=False, sharex=True, sharey=True)[0]
+    for i, axes in enumerate(panels):
+        action = cut.action[..., i].numpy()
+        mesh = axes.pcolormesh(first, second, action, cmap="coolwarm", vmin=-1, vmax=1, shading="nearest")
+        draw_sets(axes, section)
+        name = "u" if cut.action.shape[-1] == 1 else f"u_{{{i + 1}}}"
+        axes.set(title=f"Learned control ${name}$, τ = {section.tau[0]:g} s")
+        axes.set(xlabel=section.plane.axes[0], ylabel=section.plane.axes[1])
+    figure.colorbar(mesh, ax=list(panels), label="control, from its lower to its upper bound")
     return figure
 
 
