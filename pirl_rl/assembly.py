@@ -27,7 +27,7 @@ from pirl_rl.trainer import Trainer
 AUTO = "auto"
 """The value that leaves a choice to the package: env.dt, env.substeps, trainer.updates and the entries of `PATHS`."""
 
-UPDATES_PER_DIMENSION, MOST_UPDATES = 3_000, 20_000
+UPDATES_PER_DIMENSION, MOST_UPDATES = 3_500, 20_000
 """The number of updates that is chosen for each dimension of (tau, x), and the largest that is chosen."""
 
 PATHS = {

@@ -6,6 +6,7 @@ are read with `weights_only=True`, so that loading an untrusted file runs no cod
 
 from __future__ import annotations
 
+import io
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -22,9 +23,16 @@ TARGET = "target_"
 
 
 def save(state: dict[str, Any], path: Path) -> None:
-    """Write a state, a dictionary of tensors and plain values, atomically."""
+    """Write a state, a dictionary of tensors and plain values, atomically.
+
+    Raises:
+        OSError: the file cannot be written, as on a full disk; the file before stays.
+    """
+    # In memory first, because torch reports a full disk as an error of its own, without its reason.
+    content = io.BytesIO()
+    torch.save(state, content)
     with replacing(path, binary=True) as file:
-        torch.save(state, file)
+        file.write(content.getbuffer())
 
 
 def load(path: Path) -> dict[str, Any]:

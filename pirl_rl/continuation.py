@@ -7,6 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from pirl_rl import checkpoint
 from pirl_rl.checkpoint import check_entries, check_module
 from pirl_rl.errors import ArgumentError, CheckpointError, ConfigError
@@ -62,7 +64,7 @@ def start_from(trainer: Trainer, start: str) -> Path:
             learner.load_state_dict(state["learner"])
         else:
             networks = checkpoint.loss_state(state)
-            check_module(networks, learner.loss.state_dict())
+            _check_networks(networks, learner.loss.state_dict())
             learner.loss.load_state_dict(networks)
         collapsed = (state.get("rollback") or {}).get("collapsed_at") is not None
         if "collector" in state and not collapsed:
@@ -81,9 +83,28 @@ def _loaded(path: Path) -> dict[str, Any]:
 
 
 def _check_learner(state: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
-    others = {name: entry for name, entry in expected.items() if name != "loss"}
-    check_entries(state, {"learner": others})
-    check_module(state["learner"]["loss"], expected["loss"])
+    check_entries(state, {"learner": {"loss": {}}})
+    _check_networks(state["learner"]["loss"], expected["loss"])  # other networks explain all that would follow
+    check_entries(state, {"learner": {name: entry for name, entry in expected.items() if name != "loss"}})
+
+
+def _check_networks(state: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
+    """Refuse other networks than the expected ones in one sentence, and spoilt ones by the name of the entry.
+
+    Raises:
+        ArgumentError: the networks differ, or an entry is not finite.
+    """
+    for kind, prefix in (("critics", "qvalue_network_params"), ("actor", "actor_network_params")):
+        got, own = (_shapes(entries, prefix) for entries in (state, expected))
+        if got != own:
+            raise ArgumentError(f"its {kind} have weights of the shapes {got}, expected {own}")
+    check_module(state, expected)
+
+
+def _shapes(state: Mapping[str, Any], prefix: str) -> str:
+    """The shapes of the weights of a network, in the order of its layers."""
+    weights = [entry for name, entry in state.items() if name.startswith(prefix) and name.endswith("weight")]
+    return ", ".join(str(tuple(entry.shape)) for entry in weights if isinstance(entry, torch.Tensor))
 
 
 @contextmanager

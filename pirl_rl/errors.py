@@ -39,7 +39,7 @@ class CollapseError(DivergenceError):
 
 
 class RunError(PirlError, ValueError):
-    """A run directory cannot be read or compared; the message names the path."""
+    """A run directory cannot be read or compared, or another process holds it; the message names the path."""
 
 
 class PlanError(PirlError, ValueError):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import netrc
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -32,40 +32,46 @@ class MetricsLogger(Protocol):
 
 
 class CSVLogger:
-    """Writes rows to `metrics.csv`. The columns are the entries of the first row; missing entries leave empty cells."""
+    """Writes rows to `metrics.csv`, whose columns are the entries of all rows; missing entries leave empty cells."""
 
     def open(self, folder: Path, config: Mapping[str, Any]) -> None:
         self.path = RunDirectory(folder).metrics
         self.columns = self._read()[0]
 
     def log(self, row: Mapping[str, float]) -> None:
-        new = not self.columns
-        self.columns = self.columns or list(row)
-        with self.path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, self.columns, extrasaction="ignore")
-            if new:
-                writer.writeheader()
-            writer.writerow({key: f"{value:.9g}" for key, value in row.items()})
+        cells = {key: f"{value:.9g}" for key, value in row.items()}
+        if row.keys() <= {*self.columns}:
+            with self.path.open("a", newline="") as file:
+                csv.DictWriter(file, self.columns).writerow(cells)
+            return
+        # The first row, or the first evaluation after the file was lost: the file is written anew with all columns.
+        rows = self._read()[1]
+        self.columns = self.columns + [key for key in row if key not in self.columns]
+        self._write([*rows, cells])
 
     def rewind(self, update: int) -> None:
-        columns, rows = self._read()
-        if not columns:
-            return
-        with replacing(self.path) as file:
-            writer = csv.DictWriter(file, columns)
-            writer.writeheader()
-            # A row that a killed run left incomplete has no update, or one that a resumed run writes again.
-            writer.writerows(row for row in rows if (row["update"] or "").isdigit() and int(row["update"]) <= update)
+        rows = self._read()[1]
+        if self.columns:
+            self._write([row for row in rows if int(row["update"]) <= update])
 
     def close(self) -> None:
         pass
 
+    def _write(self, rows: Iterable[Mapping[str, str]]) -> None:
+        with replacing(self.path) as file:
+            writer = csv.DictWriter(file, self.columns, extrasaction="ignore")
+            writer.writeheader()
+            writer.writerows(rows)
+
     def _read(self) -> tuple[list[str], list[dict[str, str]]]:
+        """The columns, and the rows that a killed run did not leave incomplete; nothing where there is no header."""
         if not self.path.is_file():
             return [], []
-        with self.path.open(newline="") as file:
-            reader = csv.DictReader(file)
-            return list(reader.fieldnames or []), list(reader)
+        text = self.path.read_text(encoding="utf-8", errors="replace")
+        reader = csv.DictReader(text[: text.rfind("\n") + 1].splitlines())
+        columns = list(reader.fieldnames or [])
+        rows = [row for row in reader if (row.get("update") or "").isdigit() and None not in row.values()]
+        return (columns, rows) if "update" in columns else ([], [])
 
 
 class TorchRLLogger(CSVLogger):

@@ -2,6 +2,7 @@
 
 .hydra/config.yaml      the configuration, with the number of its format
 .hydra/overrides.yaml   the overrides of the command line
+.hydra/lock             held by the process that writes into the directory, which .hydra/holder names
 metrics.csv             one row of metrics for each logged update
 summary.json            the verdict, the metrics of the final evaluation, and the length of the training
 evaluation.json         the metrics of a later `python -m pirl_rl.evaluate`
@@ -31,6 +32,8 @@ class RunDirectory:
 
     CONFIG = Path(".hydra", "config.yaml")
     OVERRIDES = Path(".hydra", "overrides.yaml")
+    LOCK = Path(".hydra", "lock")
+    HOLDER = Path(".hydra", "holder")
     METRICS = Path("metrics.csv")
     SUMMARY = Path("summary.json")
     EVALUATION = Path("evaluation.json")
@@ -67,6 +70,20 @@ class RunDirectory:
     @property
     def overrides(self) -> Path:
         return self.path / self.OVERRIDES
+
+    @property
+    def lock(self) -> Path:
+        return self.path / self.LOCK
+
+    @property
+    def holder(self) -> Path:
+        """Names the process that holds the lock."""
+        return self.path / self.HOLDER
+
+    def unused(self) -> bool:
+        """Whether the directory has nothing but what a run leaves that was killed before it had a configuration."""
+        others = [path for path in self.path.iterdir() if path.name != self.CONFIG.parent.name]
+        return not others and not self.config.exists()
 
     @property
     def metrics(self) -> Path:

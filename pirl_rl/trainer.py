@@ -47,6 +47,8 @@ class Trainer:
         log_every: updates between rows of metrics.
         evaluate_every: updates between evaluations during training; 0 for none.
         checkpoint_every: updates between checkpoints; 0 for the last one only.
+        checkpoint_seconds: seconds after which there is a checkpoint in any case, so that a kill costs no more; 0 for
+            none.
         rollback: whether a run that collapses ends with the networks of its last good evaluation, see `Guard`.
         during, final: evaluators during and after training, by name.
         simulator: plays the paths of the evaluators; default a `Simulator` of the problem with its default steps.
@@ -73,6 +75,7 @@ class Trainer:
         log_every: int = 100,
         evaluate_every: int = 1_500,
         checkpoint_every: int = 5_000,
+        checkpoint_seconds: float = 60.0,
         rollback: bool = False,
         during: Mapping[str, Evaluator] | None = None,
         final: Mapping[str, Evaluator] | None = None,
@@ -91,6 +94,9 @@ class Trainer:
         ):
             if not (isinstance(value, int) and value >= least):
                 raise ArgumentError(f"trainer.{name}: expected an integer >= {least}, got {value!r}")
+        if not checkpoint_seconds >= 0:
+            raise ArgumentError(f"trainer.checkpoint_seconds: expected a number >= 0, got {checkpoint_seconds!r}")
+        self.checkpoint_seconds, self._saved_at = checkpoint_seconds, 0.0
         self.learner, self.collector = learner, collector
         self.curriculum = Curriculum(schedule, updates, stages or (Stage(),))
         self._run_settings = StageSettings(
@@ -164,7 +170,7 @@ class Trainer:
                 self.save()
 
     def _loop(self, interrupted: Callable[[], bool]) -> None:
-        started = time.perf_counter() - self.wall_seconds
+        started, self._saved_at = time.perf_counter() - self.wall_seconds, time.perf_counter()
         with Progress(self.updates, self.update) as progress:
             for k in range(self.update, self.updates):
                 if self.curriculum.is_first(k):
@@ -182,7 +188,8 @@ class Trainer:
                     self.rollback.judge(self.update, row)
                 stop = interrupted() and self.update < self.updates
                 due = bool(self.checkpoint_every) and self.update % self.checkpoint_every == 0
-                if due or stop or self.update == self.updates:
+                late = 0 < self.checkpoint_seconds <= time.perf_counter() - self._saved_at
+                if due or late or stop or self.update == self.updates:
                     self.save(keep_weights=due and self.update < self.updates)
                 if stop:
                     raise Interrupted(self.update)
@@ -237,7 +244,7 @@ class Trainer:
         if keep_weights:
             weights = {"loss": self.learner.loss.state_dict(), "update": self.update}
             checkpoint.save(weights, run.weights(self.update))
-        self.saved = self.update
+        self.saved, self._saved_at = self.update, time.perf_counter()
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that an exact continuation needs, as tensors and plain values."""

@@ -15,7 +15,14 @@ from pirl_rl.grid import GridSolution, GridSolver
 from pirl_rl.problems import CartPole, DubinsCar, HalfSpace, Reach1D, ZermeloBoat
 
 SMALL = {"grid": {"points": 81}}
-SMALL |= {"evaluation": {"success": {"episodes": 500}, "calibration": {"points": 20, "rollouts": 100}}}
+SMALL |= {
+    "evaluation": {
+        "success": {"episodes": 500},
+        "calibration": {"points": 20, "rollouts": 100},
+        "slices": {"points": 5, "rollouts": 2},
+        "verdict": {"points": 20, "rollouts": 8},
+    }
+}
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +40,13 @@ def test_a_grid_leaves_a_run_directory(run, folder):
     assert 0 < summary["grid_error"] < 0.05
     assert summary["masked_value_mse"] < 1e-3
     assert 0.3 < summary["success_rate"] < 0.9
-    assert {path.name for path in (folder / "figures").iterdir()} == {"surface.png", "value.png", "policy.png"}
+    assert {path.name for path in (folder / "figures").iterdir()} == {
+        "surface.png",
+        "value.png",
+        "policy.png",
+        "calibration.png",
+    }
+    assert summary["verdict"] == "solved"
 
 
 def test_its_run_answers_like_any_other(run, folder):

@@ -227,7 +227,7 @@ def test_a_number_beside_auto_is_kept(capsys):
 
 
 @pytest.mark.parametrize(
-    ("experiment", "updates"), [("reach1d", 6_000), ("zermelo", 9_000), ("dubins", 12_000), ("quadrotor", 20_000)]
+    ("experiment", "updates"), [("reach1d", 7_000), ("zermelo", 10_500), ("dubins", 14_000), ("quadrotor", 20_000)]
 )
 def test_the_length_of_a_run_follows_the_number_of_states(experiment, updates):
     config = compose("train", [f"+experiment={experiment}"])

@@ -8,8 +8,9 @@ import torch
 from pirl_rl.evaluation import Verdict, lines_of, metrics_of, statements_of
 from pirl_rl.evaluation.judgement import Difference, Measures, describe, judge
 from pirl_rl.evaluation.other_policies import constant_actions, play_open_loop
+from pirl_rl.grid import GridSolver
 from pirl_rl.operators import generator
-from pirl_rl.problems import Exit1D, HalfSpace, Reach1D
+from pirl_rl.problems import Exit1D, HalfSpace, Reach1D, Safety1D
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
@@ -193,3 +194,13 @@ def test_the_number_of_constant_controls_does_not_grow_with_their_dimension():
 def test_too_few_samples_are_refused(settings):
     with pytest.raises(ValueError, match=r"Verdict: expected points >= 8"):
         Verdict(**settings)
+
+
+def test_a_time_step_that_is_too_long_is_doubtful():
+    """A regulator that holds its control for 0.4 s overshoots; the grid's value is that of a control without a hold."""
+    solution = GridSolver(Safety1D()).solve()
+    assert judged(solution, dt=0.005)[1]["verdict"] == "solved"
+    evidence, statements = judged(solution, dt=0.4)
+    assert statements["verdict"] != "solved"
+    assert "With shorter time steps success changes by +0." in statements["verdict_reason"]
+    assert "look-ahead" not in "".join(lines_of(evidence))  # the grid's policy is the best of its candidates already

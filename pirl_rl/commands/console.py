@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import site
 import sys
 import sysconfig
@@ -11,6 +12,7 @@ import traceback
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import CompactHydraException, HydraException
@@ -22,6 +24,9 @@ from pirl_rl.errors import INTERRUPTED, ConfigError, Interrupted, PirlError
 
 EXPECTED = (PirlError, HydraException, OmegaConfBaseException)
 """Errors whose message alone tells the user what to correct."""
+
+UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM)
+"""Reasons of the operating system not to write a file, which are no mistakes of a program."""
 
 LIBRARIES = tuple(
     Path(path).resolve()
@@ -62,8 +67,8 @@ def named_modules(overrides: Sequence[str]) -> list[str]:
     return [target.partition(".")[0] for target in targets]
 
 
-def override(config: DictConfig, text: str) -> None:
-    """Apply an override `key=value` to the configuration of a run.
+def override(config: DictConfig, text: str) -> tuple[Any, Any]:
+    """Apply an override `key=value` to the configuration of a run; returns the value before and the new one.
 
     Raises:
         ConfigError: if the text is no such override, or sets more than a single setting.
@@ -75,7 +80,9 @@ def override(config: DictConfig, text: str) -> None:
     plain = "=" in text and not text.startswith(("+", "~")) and not parsed.is_sweep_override()
     if not plain or isinstance(OmegaConf.select(config, parsed.key_or_group), DictConfig):
         raise ConfigError(f"{text}: expected key=value of an existing run's single settings only")
+    before = OmegaConf.select(config, parsed.key_or_group)
     OmegaConf.update(config, parsed.key_or_group, parsed.value())
+    return before, parsed.value()
 
 
 @contextlib.contextmanager
@@ -96,6 +103,10 @@ def reported(folder: Path, one_of_many: bool = False) -> Iterator[None]:
         raise SystemExit(INTERRUPTED) from None
     except EXPECTED as error:
         _end(f"error: {_one_line(error)}", one_of_many)
+    except OSError as error:
+        if error.errno not in UNWRITABLE:
+            traceback.print_exc()
+        _end(f"error: {error.strerror or error}: {error.filename or folder}", one_of_many)
     except Exception as error:
         traceback.print_exc()
         _end(f"error: {type(error).__name__}: {_first_line(str(error))}{_users_place(error)}", one_of_many)

@@ -24,9 +24,10 @@ from pirl_rl.commands.methods import check_method
 from pirl_rl.commands.solve import solve
 from pirl_rl.configuration import CONF, load_config, save_config
 from pirl_rl.continuation import restore, start_from
-from pirl_rl.errors import INTERRUPTED, ConfigError
+from pirl_rl.errors import INTERRUPTED, CheckpointError, ConfigError
 from pirl_rl.evaluation import lines_of, meanings_of
 from pirl_rl.figures import draw_run
+from pirl_rl.lock import locked
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.trainer import Trainer
@@ -78,11 +79,7 @@ def train_new(
             return solve(config, folder, overrides, trust, problem)
         trainer = make_trainer(config, folder, trust, problem)
         if config.start is not None:
-            # The absolute path of the file is recorded: the typed path may be relative, or that of a run directory
-            # whose newest checkpoint changes when the run is resumed.
-            if not isinstance(config.start, str):
-                raise ConfigError(f"start: expected the path of a run or a checkpoint, got {config.start!r}")
-            config.start = str(start_from(trainer, config.start))
+            _start(trainer, config)
         save_config(config, folder)
         OmegaConf.save(overrides, RunDirectory(folder).overrides)
         return _train(trainer, config.verbose)
@@ -90,20 +87,54 @@ def train_new(
 
 def resume(folder: Path, overrides: Sequence[str]) -> None:
     """Resume a run, with overrides `key=value` that change its configuration for good."""
-    with reported(folder):
+    run = RunDirectory(folder)
+    with reported(folder), contextlib.ExitStack() as held:
         config = load_config(folder)
-        RunDirectory(folder).refuse_links()
+        run.refuse_links()
+        held.enter_context(locked(run))
         config.trust = []
         for text in overrides:
             if text.startswith("start="):
                 raise ConfigError(f"{text}: the run has begun already; start= is for new runs, without resume=")
-            override(config, text)
+            before, after = override(config, text)
+            print(f"resume: {text.partition('=')[0]} was {before}, and is {after} from now on", flush=True)
         if config.get("grid") is not None:
             raise ConfigError(f"resume: expected a run that was trained, but {folder} holds the solution of a grid")
         trainer = make_trainer(config, folder, [*config.trust, *named_modules(overrides)])
-        restore(trainer)
+        if run.last.exists():
+            restore(trainer)
+        else:
+            print("resume: the run has no checkpoint yet and starts again at update 0", flush=True)
+            if config.get("start") is not None:
+                _start(trainer, config)
         save_config(config, folder)
         _train(trainer, config.get("verbose", False))
+
+
+def _start(trainer: Trainer, config: DictConfig) -> None:
+    """Take the networks of another run, and record the file in the configuration.
+
+    The absolute path of the file is recorded: the given path may be relative, or that of a run directory whose newest
+    checkpoint changes when the run is resumed.
+
+    Raises:
+        ConfigError: if `start` is no path.
+        CheckpointError: if the networks do not fit; the message names the method of the other run where it differs.
+    """
+    start = config.start
+    if not isinstance(start, str):
+        raise ConfigError(f"start: expected the path of a run or a checkpoint, got {start!r}")
+    try:
+        config.start = str(start_from(trainer, start))
+    except CheckpointError as error:
+        run = RunDirectory(start) if Path(start).is_dir() else RunDirectory.of_checkpoint(Path(start))
+        method = load_config(run.path).get("method_name") if run.config.is_file() else None
+        if method in (None, config.method_name):
+            raise
+        raise CheckpointError(
+            f"{error}; that run had method={method} and this one has method={config.method_name}, whose networks may "
+            f"differ: give method={method}, or start from a run with method={config.method_name}"
+        ) from None
 
 
 def _train(trainer: Trainer, verbose: bool) -> dict[str, float]:
@@ -126,13 +157,14 @@ def _new(folder: Path) -> Iterator[None]:
         ConfigError: if the directory is not empty.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    if any(folder.iterdir()):
+    run = RunDirectory(folder)
+    if not run.unused():
         raise ConfigError(
             f"hydra.run.dir: expected an empty directory, but {folder} is not empty, and no run overwrites files"
         )
-    run = RunDirectory(folder)
     try:
-        yield
+        with locked(run):
+            yield
     except BaseException:
         if not any(path.exists() for path in (run.metrics, run.checkpoints, run.grid)):
             shutil.rmtree(folder)

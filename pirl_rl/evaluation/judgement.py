@@ -100,10 +100,7 @@ class Measures:
 
 def judge(m: Measures) -> list[Reason]:
     """The reasons against a solution, the gravest first; none if it is solved."""
-    reasons = [*_failures(m)]
-    if not any(reason.level == "failed" for reason in reasons):
-        reasons += _doubts(m)
-    return reasons
+    return [*_failures(m), *_doubts(m)]
 
 
 def _failures(m: Measures):
@@ -142,7 +139,7 @@ def _failures(m: Measures):
 
 
 def _doubts(m: Measures):
-    if m.error > GAP or abs(m.bias) > BIAS:
+    if m.error <= LARGE_GAP and (m.error > GAP or abs(m.bias) > BIAS):
         sign = "above" if m.bias > 0 else "below"
         yield Reason(
             "doubtful",
@@ -179,11 +176,8 @@ def describe(m: Measures, reasons: list[Reason]) -> list[str]:
         f"value     mean |V - Monte Carlo| {m.gap:.4f}, of which noise {m.noise:.4f}; with shorter steps "
         f"{m.gap_finer:.4f}, of which noise {m.noise_finer:.4f}"
     )
-    lines.append(
-        f"residual  another control raises V by up to {m.gain:.3g} per s, most at x = {_numbers(m.gain_at)}"
-        if m.gain > 0
-        else "residual  no other control raises V"
-    )
+    if m.gain > 0:
+        lines.append(f"residual  another control raises V by up to {m.gain:.3g} per s, most at {_numbers(m.gain_at)}")
     if m.still:
         names = f"component {m.still[0]}" if len(m.still) == 1 else f"components {', '.join(map(str, m.still))}"
         lines.append(f"control   {names} of the control never move{'s' if len(m.still) == 1 else ''}")
