@@ -20,7 +20,7 @@ SMALL |= {
         "success": {"episodes": 500},
         "calibration": {"points": 20, "rollouts": 100},
         "slices": {"points": 5, "rollouts": 2},
-        "verdict": {"points": 20, "rollouts": 8},
+        "verdict": {"points": 100, "rollouts": 32},
     }
 }
 

@@ -6,7 +6,7 @@ import pytest
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
-from pirl_rl.assembly import make_trainer
+from pirl_rl.assembly import PATHS, make_trainer
 from pirl_rl.building import build, parameters_of, resolve
 from pirl_rl.commands.composition import arguments, compose, drop_leftovers
 from pirl_rl.commands.methods import check_method, owned
@@ -155,7 +155,7 @@ def test_what_differs_from_the_constructors_stands_in_the_method_and_its_recipe(
     config = compose("train", ["+experiment=reach1d", f"method={method}"])
     chosen = {key for key, _ in owned(method)} | {"schedule.center", "schedule.steepness"}
     chosen |= {f"{simulator}.{name}" for simulator in ("env", "evaluation.simulator") for name in ("dt", "substeps")}
-    chosen |= {"evaluation.success.episodes", "evaluation.calibration.rollouts"}
+    chosen |= {f"evaluation.{evaluator}.{argument}" for evaluator, argument in PATHS}
     if method == "pirl":
         recipe = OmegaConf.load(CONF / "recipe" / "any_problem.yaml")
         chosen |= {f"{group}.{name}" for group in recipe for name in recipe[group]}

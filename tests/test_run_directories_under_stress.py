@@ -170,7 +170,7 @@ def limited(size: int, *arguments: str, cwd: Path) -> subprocess.CompletedProces
 SIZES = random.Random(0).sample(range(500, 200_000), 20)
 
 
-@pytest.mark.parametrize("size", [2_000, 60_000, *(pytest.param(size, marks=pytest.mark.slow) for size in SIZES)])
+@pytest.mark.parametrize("size", [60_000, *(pytest.param(size, marks=pytest.mark.slow) for size in SIZES)])
 def test_a_full_disk_ends_with_one_line(size, run, tmp_path):
     """A resumed run that cannot write its checkpoint keeps the one before, and a new run leaves one that opens."""
     before = run.last.read_bytes()

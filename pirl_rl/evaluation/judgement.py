@@ -63,7 +63,7 @@ class Measures:
         gap: the mean of |V - Monte Carlo|.
         noise: what `gap` would be for a perfect V.
         gap_finer, noise_finer: like `gap` and `noise`, with shorter time steps.
-        bias: the mean of V - Monte Carlo.
+        bias: the mean of V - Monte Carlo, with its error.
         value_spread, success_spread: standard deviations of V and of Monte Carlo over the states.
         still: numbers of the controls that never move.
         gain: the largest gain of V per s that the HJB residual promises for another control, over the states.
@@ -84,7 +84,7 @@ class Measures:
     noise: float
     gap_finer: float
     noise_finer: float
-    bias: float
+    bias: Difference
     value_spread: float
     success_spread: float
     still: list[int]
@@ -139,11 +139,11 @@ def _failures(m: Measures):
 
 
 def _doubts(m: Measures):
-    if m.error <= LARGE_GAP and (m.error > GAP or abs(m.bias) > BIAS):
-        sign = "above" if m.bias > 0 else "below"
+    if m.error <= LARGE_GAP and (m.error > GAP or m.bias.matters(BIAS)):
+        sign = "above" if m.bias.mean > 0 else "below"
         yield Reason(
             "doubtful",
-            f"V is wrong by {m.error:.3f} on average, and {abs(m.bias):.3f} {sign} Monte Carlo of its own policy.",
+            f"V is wrong by {m.error:.3f} on average, and {abs(m.bias.mean):.3f} {sign} Monte Carlo of its own policy.",
             "train longer (trainer.updates) or with wider networks (critic.hidden)",
         )
     if m.ahead is not None and m.ahead.mean > 0 and m.ahead.matters():

@@ -55,7 +55,7 @@ class VerdictEvidence:
             "value_gap": m.gap,
             "value_gap_noise": m.noise,
             "value_gap_finer": m.gap_finer,
-            "value_bias": m.bias,
+            "value_bias": m.bias.mean,
         }
 
     def statements(self) -> dict[str, str]:
@@ -149,7 +149,7 @@ class Verdict:
                 noise=_expected_deviation(learned, self.rollouts),
                 gap_finer=(value[few] - finely).abs().mean().item(),
                 noise_finer=_expected_deviation(finely, max(2, self.rollouts // 2)),
-                bias=(value - learned).mean().item(),
+                bias=_difference(value, learned),
                 value_spread=value.std().item(),
                 success_spread=learned.std().item(),
                 still=(u.std(0) < STILL).nonzero().flatten().tolist(),
