@@ -66,7 +66,8 @@ def test_the_python_block_trains(home, tmp_path, monkeypatch):
     """The third state lies in the drain: V and its Monte Carlo are exactly 0, and its path has failed."""
     monkeypatch.syspath_prepend(str(home))
     monkeypatch.chdir(tmp_path)
-    block, shortened = re.subn(r"\(Whirlpool, ", "(Whirlpool, updates=30, compile=False, evaluation={'final': []}, ", TRAIN)
+    quick = "updates=30, compile=False, evaluation={'final': []}"
+    block, shortened = re.subn(r"\(Whirlpool, ", f"(Whirlpool, {quick}, ", TRAIN)
     assert shortened == 1
     names = {}
     exec(block, names)
