@@ -40,8 +40,8 @@ class Known(Solution):
         return self._value(tau, x).unsqueeze(0)
 
 
-def judged(solution, dt=0.01, **settings):
-    evidence = {"verdict": Verdict(points=200, **settings)(solution, Simulator(solution.problem, dt, 2))}
+def judged(solution, dt=0.02, **settings):
+    evidence = {"verdict": Verdict(points=100, **settings)(solution, Simulator(solution.problem, dt, 2))}
     return evidence, statements_of(evidence)
 
 
