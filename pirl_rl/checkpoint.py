@@ -6,7 +6,6 @@ are read with `weights_only=True`, so that loading an untrusted file runs no cod
 
 from __future__ import annotations
 
-import io
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -28,11 +27,13 @@ def save(state: dict[str, Any], path: Path) -> None:
     Raises:
         OSError: the file cannot be written, as on a full disk; the file before stays.
     """
-    # In memory first, because torch reports a full disk as an error of its own, without its reason.
-    content = io.BytesIO()
-    torch.save(state, content)
     with replacing(path, binary=True) as file:
-        file.write(content.getbuffer())
+        try:
+            torch.save(state, file)
+        except RuntimeError as error:  # by which torch reports a failed write, such as that on a full disk
+            if isinstance(error.__context__, OSError):
+                raise error.__context__ from None
+            raise
 
 
 def load(path: Path) -> dict[str, Any]:

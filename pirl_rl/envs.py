@@ -70,7 +70,8 @@ class ReachAvoidEnv(EnvBase):
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.problem = problem
         self.simulator = Simulator(problem, dt, substeps, crossing, compile_simulator)  # type: ignore[arg-type]
-        self.supply = Supply(num_envs, initial_states or UniformStates())
+        self._initial_states = initial_states or UniformStates()
+        self.supply = Supply(num_envs)
         self.max_steps = self.simulator.clock.max_steps
         self._make_specs()
         self.rng = torch.Generator(device=self.device)
@@ -79,12 +80,12 @@ class ReachAvoidEnv(EnvBase):
     @property
     def initial_states(self) -> InitialStates:
         """The distribution of the initial states of episodes; another one counts from the next reset."""
-        return self.supply.distribution
+        return self._initial_states
 
     @initial_states.setter
     def initial_states(self, distribution: InitialStates) -> None:
-        if distribution is not self.supply.distribution:
-            self.supply = Supply(self.supply.size, distribution)
+        if distribution is not self._initial_states:
+            self._initial_states, self.supply = distribution, Supply(self.supply.size)
 
     def recipe(self, seed: int) -> Callable[[], ReachAvoidEnv]:
         """A picklable function that builds a copy of this environment on the CPU, with the given seed."""
@@ -125,9 +126,12 @@ class ReachAvoidEnv(EnvBase):
             ended = tensordict["_reset"].reshape(-1)
             tau, state = tensordict["tau"].clone(), tensordict["state"].clone()
             visited = state[~ended]
-        steps, started = self.supply.take(self.problem, int(ended.sum()), self.max_steps, self.rng, dtype, visited)
-        tau[ended] = self.simulator.clock.time(steps).to(dtype).unsqueeze(-1)
-        state[ended] = self.problem.states.wrap(started)
+        steps, started = self.supply.take(
+            int(ended.sum()),
+            lambda count: self.initial_states.sample(self.problem, count, self.max_steps, self.rng, dtype, visited),
+        )
+        tau[ended] = self.simulator.clock.time(steps).to(tau).unsqueeze(-1)
+        state[ended] = self.problem.states.wrap(started.to(state))
         none = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
         return TensorDict(
             {
@@ -168,4 +172,4 @@ class ReachAvoidEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self.rng.manual_seed(seed)
-            self.supply = Supply(self.supply.size, self.initial_states)
+            self.supply = Supply(self.supply.size)

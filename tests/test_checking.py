@@ -211,6 +211,11 @@ class WrongAnswer(Reach1D):
         return 1 - super().exact_value(tau, x)
 
 
+class RaisesInItsAnswer(Reach1D):
+    def exact_value(self, tau, x):
+        raise ZeroDivisionError("no series")
+
+
 class ForbiddenControl(Reach1D):
     def optimal_control(self, tau, x):
         return torch.full_like(x, 100.0)
@@ -272,6 +277,7 @@ FAULTS = [
     (PeriodicControl, "error", "controls", "only states may be periodic"),
     (UnknownObjective, "error", "objective", "invariance"),
     (WrongAnswer, "error", "exact_value", "expected the payoff"),
+    (RaisesInItsAnswer, "error", "exact_value", "got ZeroDivisionError: no series"),
     (ForbiddenControl, "error", "optimal_control", "expected controls in"),
     (WrongPlane, "error", "planes", "plane 'xy'"),
     (TwoTargets, "error", "target_level", "another set than target_constraints"),

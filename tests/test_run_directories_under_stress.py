@@ -216,3 +216,14 @@ def test_a_start_from_another_method_is_told_in_one_sentence(tmp_path, cli):
     assert ", expected (1, 64, " in line
     assert "that run had method=td3 and this one has method=pirl" in line
     assert "Traceback" not in text
+
+
+def test_a_new_run_refuses_the_directory_of_one_that_has_just_begun(tmp_path, cli):
+    """The first process holds the lock and has written nothing else yet; the second must not clean up after it."""
+    run = RunDirectory(tmp_path / "run")
+    with locked(run):
+        code, text = cli(*RUN, f"hydra.run.dir={run}")
+        assert run.holder.is_file()
+    assert code == 1
+    assert "another process writes into this run directory" in text
+    assert run.path.is_dir()

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 
 from pirl_rl.checking import answers, dynamics, level_sets, methods
-from pirl_rl.checking.findings import Finding, found, raised_in, report
+from pirl_rl.checking.findings import Finding, found, method_that_raised, raised_in, report
 from pirl_rl.checking.samples import Samples
 from pirl_rl.errors import ProblemError
 from pirl_rl.problem import ReachAvoidProblem
@@ -29,7 +29,7 @@ def check(problem: ReachAvoidProblem, dt: float | None = None, substeps: int | N
     """
     findings = examine(problem, dt, substeps)
     if errors := report(findings, ["error"]):
-        raise ProblemError(errors.removeprefix("error").strip())
+        raise ProblemError(errors.removeprefix("error").strip())  # the commands print `error:` before a message
     return findings
 
 
@@ -94,4 +94,4 @@ def _guarded(one: Check, samples: Samples) -> list[Finding]:
         return [*one(samples)]
     except Exception as error:
         message = f"expected a result at every state, got {type(error).__name__}: {error}".partition("\n")[0] + "."
-        return [found(samples.problem, "error", "drift", message, place=raised_in(error))]
+        return [found(samples.problem, "error", method_that_raised(error), message, place=raised_in(error))]

@@ -52,7 +52,7 @@ def noise(samples: Samples) -> Iterator[Finding]:
     rank = torch.linalg.matrix_rank(scaled).double()
     n = x.shape[-1]
     if float(rank.max()) == 0:
-        message = "the noise is 0 everywhere; V then jumps from 0 to 1, which no network learns, and needs some noise."
+        message = "the noise is 0 everywhere, so that V jumps from 0 to 1, which no network learns; add some noise."
         yield found(problem, "warning", "diffusion", message)
     elif float(rank.max()) < n:
         message = (

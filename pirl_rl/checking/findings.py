@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import traceback
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,11 +10,10 @@ from typing import Literal
 
 from torch import Tensor
 
+from pirl_rl.places import users_frames
 from pirl_rl.problem import ReachAvoidProblem
 
 Level = Literal["error", "warning", "note"]
-
-PACKAGE = Path(__file__).resolve().parents[1]
 
 
 @dataclass(frozen=True)
@@ -66,13 +64,15 @@ def source_of(problem: ReachAvoidProblem, part: str) -> str:
 
 
 def raised_in(error: BaseException) -> str:
-    """The file and the line of the innermost frame of an exception that belongs to the problem's module."""
-    for frame in reversed(traceback.extract_tb(error.__traceback__)):
-        path = Path(frame.filename)
-        in_package = path.resolve().is_relative_to(PACKAGE) and path.parent.name != "problems"
-        if "site-packages" not in path.parts and not in_package:
-            return f"{path.name}, line {frame.lineno}"
-    return ""
+    """The file and the line of the user's code in which an exception was raised; empty where it is not known."""
+    frames = users_frames(error)
+    return f"{Path(frames[-1].filename).name}, line {frames[-1].lineno}" if frames else ""
+
+
+def method_that_raised(error: BaseException) -> str:
+    """The name of the problem's method that was called when an exception was raised; the drift if it is not known."""
+    names = (frame.name for frame in users_frames(error))
+    return next((name for name in names if hasattr(ReachAvoidProblem, name)), "drift")
 
 
 def report(findings: Iterable[Finding], levels: Iterable[Level] = ("error", "warning", "note")) -> str:

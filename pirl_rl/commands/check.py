@@ -21,9 +21,9 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from pirl_rl.checking import Finding, examine, report
+from pirl_rl.checking import Finding, check, examine, report
 from pirl_rl.commands.console import quiet_libraries, reported
-from pirl_rl.errors import ConfigError, ProblemError
+from pirl_rl.errors import ConfigError
 from pirl_rl.problem import ReachAvoidProblem
 
 
@@ -57,10 +57,7 @@ def check_before_training(config: DictConfig, problem: ReachAvoidProblem) -> Non
     """
     # The word `auto` leaves a step to the package, and an environment of one's own may have no such setting.
     dt, substeps = (None if isinstance(value := config.env.get(name), str) else value for name in ("dt", "substeps"))
-    findings = examine(problem, dt, substeps)
-    if errors := report(findings, ["error"]):
-        raise ProblemError(errors.replace("error", "", 1).strip())
-    if warnings := report(findings, ["warning"]):
+    if warnings := report(check(problem, dt, substeps), ["warning"]):
         print(warnings, flush=True)
 
 
@@ -71,7 +68,6 @@ def _problem(named: str, settings: dict[str, Any]) -> ReachAvoidProblem:
         ConfigError: there is no such module or class, or it does not take the arguments.
     """
     module, _, name = named.partition(":")
-    sys.path.insert(0, "")
     try:
         kind = getattr(importlib.import_module(module), name)
     except ModuleNotFoundError as error:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import site
 import sys
-import sysconfig
 import textwrap
 import traceback
 import warnings
@@ -19,20 +17,14 @@ from hydra.errors import CompactHydraException, HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from pirl_rl.configuration import PACKAGE
 from pirl_rl.errors import INTERRUPTED, ConfigError, Interrupted, PirlError
+from pirl_rl.places import is_users, users_frames
 
 EXPECTED = (PirlError, HydraException, OmegaConfBaseException)
 """Errors whose message alone tells the user what to correct."""
 
 UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM)
 """Reasons of the operating system not to write a file, which are no mistakes of a program."""
-
-LIBRARIES = tuple(
-    Path(path).resolve()
-    for path in (PACKAGE, sysconfig.get_path("stdlib"), sysconfig.get_path("purelib"), *site.getsitepackages())
-)
-"""Folders whose code is not the user's."""
 
 
 def quiet_libraries() -> None:
@@ -131,11 +123,7 @@ def _first_line(text: str) -> str:
 
 def _users_place(error: Exception) -> str:
     """ " (file, line)" of the innermost frame outside this package and the libraries; empty without one."""
-    places = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
-    if isinstance(error, SyntaxError) and error.filename:
-        places.append((error.filename, error.lineno))
-    for file, line in reversed(places):
-        path = Path(file).resolve()
-        if path.is_file() and not any(path.is_relative_to(folder) for folder in LIBRARIES):
-            return f" ({file}, line {line})"
-    return ""
+    if isinstance(error, SyntaxError) and error.filename and is_users(error.filename):
+        return f" ({error.filename}, line {error.lineno})"
+    frames = users_frames(error)
+    return f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""

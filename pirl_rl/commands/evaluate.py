@@ -37,6 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         overrides = [item for item in arguments if item not in named]
         config = load_config(folder)
         config.trust = []
+        config.setdefault("verbose", False)  # older runs have no such setting
         for text in overrides:
             override(config, text)
         trust = [*config.trust, *named_modules(overrides)]
@@ -49,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             file.write(json.dumps(statements_of(evidence) | metrics, indent=2) + "\n")
         figures = draw_run(solution, run.metrics, run.figures, evidence)
     meanings = meanings_of(evaluators, solution.problem)
-    print(outcome(lines_of(evidence), metrics, meanings, config.get("verbose", False)))
+    print(outcome(lines_of(evidence), metrics, meanings, config.verbose))
     for figure in figures:
         print(f"figure   {figure}")
     print(f"written  {run.evaluation}")

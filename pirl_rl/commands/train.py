@@ -155,6 +155,7 @@ def _new(folder: Path) -> Iterator[None]:
 
     Raises:
         ConfigError: if the directory is not empty.
+        RunError: if another process has just begun a run there.
     """
     folder.mkdir(parents=True, exist_ok=True)
     run = RunDirectory(folder)
@@ -162,16 +163,16 @@ def _new(folder: Path) -> Iterator[None]:
         raise ConfigError(
             f"hydra.run.dir: expected an empty directory, but {folder} is not empty, and no run overwrites files"
         )
-    try:
-        with locked(run):
+    with locked(run):
+        try:
             yield
-    except BaseException:
-        if not any(path.exists() for path in (run.metrics, run.checkpoints, run.grid)):
-            shutil.rmtree(folder)
-            for parent in (folder.parent, folder.parent.parent):
-                with contextlib.suppress(OSError):
-                    parent.rmdir()  # fails for a folder that is not empty
-        raise
+        except BaseException:
+            if not any(path.exists() for path in (run.metrics, run.checkpoints, run.grid)):
+                shutil.rmtree(folder)
+                for parent in (folder.parent, folder.parent.parent):
+                    with contextlib.suppress(OSError):
+                        parent.rmdir()  # fails for a folder that is not empty
+            raise
 
 
 def main() -> None:

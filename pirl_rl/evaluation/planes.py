@@ -77,8 +77,9 @@ def _steepest(solution: Solution) -> tuple[int, int]:
     """The pair of coordinates, other than the first two, with the largest mean slopes of V across the box."""
     problem = solution.problem
     x = problem.states.sample(STATES, torch.Generator().manual_seed(0), torch.float64)
-    tau, x = like(solution, torch.full((len(x),), problem.horizon), x[problem.interior(x)])
-    slope = solution.gradient(tau[: len(x)], x) * problem.states.center_and_half_width(x)[1]
+    x = x[problem.interior(x)]
+    tau, x = like(solution, torch.full((len(x),), problem.horizon), x)
+    slope = solution.gradient(tau, x) * problem.states.center_and_half_width(x)[1]
     order = slope.abs().mean(0).argsort(descending=True).tolist()
     pair = order[:2] if {*order[:2]} != {0, 1} else [order[0], order[2]]
     return min(pair), max(pair)

@@ -24,8 +24,8 @@ from pirl_rl.solution import Solution
 FINER = 2
 """The shorter control step is this part of that of the training."""
 
-FEWER = 4
-"""Of so many states one is used where a path costs this many times as much."""
+SHARE = 4
+"""Policies whose paths cost several times as much are played from one state in this many."""
 
 OPEN_LOOP = 8
 """The number of paths of each constant control, and of random ones, from each state."""
@@ -61,8 +61,8 @@ class VerdictEvidence:
     def statements(self) -> dict[str, str]:
         """The verdict and its reason, for the summary."""
         reasons = judge(self.measures)
-        level, _ = verdict_of(reasons)
-        return {"verdict": level, "verdict_reason": " ".join(reason.why for reason in reasons) or verdict_of([])[1]}
+        level, why = verdict_of(reasons)
+        return {"verdict": level, "verdict_reason": " ".join([why, *(reason.why for reason in reasons[1:])])}
 
     def lines(self) -> list[str]:
         """The verdict in at most eight lines."""
@@ -100,10 +100,10 @@ class Verdict:
             "success_random": "The success of controls that are drawn at random in each control step, from there.",
             "success_constant": "The success of the best constant control out of the vertices and the centre of the "
             "box of controls, from there.",
-            "success_ahead": "The success of the policy that looks one control step ahead, from a part of these "
-            "states, added to success_learned as a difference.",
-            "success_finer": f"The success of the learned policy with control steps that are {FINER} times as short, "
-            "likewise.",
+            "success_ahead": "success_learned, plus the gain from looking one control step ahead, which is measured "
+            f"from one state in {SHARE}.",
+            "success_finer": f"success_learned, plus the gain from control steps that are {FINER} times as short, "
+            f"which is measured from one state in {SHARE}.",
             "value_gap": "The mean of |V - Monte Carlo| at these states.",
             "value_gap_noise": "What value_gap would be for a perfect V.",
             "value_gap_finer": f"Like value_gap, with control steps that are {FINER} times as short.",
@@ -115,7 +115,7 @@ class Verdict:
         _, x = self.initial_states.sample(problem, self.points, 1, rng, solution.dtype)
         fraction = 1 - torch.rand(self.points, generator=rng, dtype=solution.dtype)
         tau, x = problem.horizon * fraction.to(solution.device), x.to(solution.device)
-        few = slice(0, max(8, self.points // FEWER))
+        few = slice(0, max(8, self.points // SHARE))
 
         def play(policy: Policy, rollouts: int, where: slice = slice(None), refinement: int = 1):
             noise = noise_rng(solution, self.seed)
@@ -129,7 +129,7 @@ class Verdict:
         ahead, gain, worst = None, 0.0, 0
         if not isinstance(solution, GridSolution):  # whose policy is the best of its candidates already
             policy = look_ahead_policy(solution, simulator, 1, LEVELS)
-            ahead = _difference(play(policy, max(2, self.rollouts // FEWER), few), learned[few])
+            ahead = _difference(play(policy, max(2, self.rollouts // SHARE), few), learned[few])
             gains = largest_residual(solution, tau, x, along := solution.residual(tau, x), LEVELS) - along
             worst = int(gains.argmax())
             gain = gains[worst].item()

@@ -2,46 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.sampling.initial_states import InitialStates
+Draw = Callable[[int], tuple[Tensor, Tensor]]
+"""Draws a number of initial states: control steps to go (count,) and states (count, n)."""
 
 
 class Supply:
-    """Initial states of one distribution, drawn `size` at a time and given out one after the other.
+    """Initial states, drawn `size` at a time and given out one after the other.
 
     In each step of an environment only a few episodes end. To draw a few states costs nearly as much as to draw
     thousands, so that drawing them for each step would be a third of the time that collection takes.
 
     Args:
         size: the number of initial states of a draw, and the most that can be taken at once.
-        distribution: gives the initial states.
     """
 
-    def __init__(self, size: int, distribution: InitialStates):
-        self.size, self.distribution = size, distribution
+    def __init__(self, size: int):
+        self.size = size
         self._steps, self._states = torch.empty(0, dtype=torch.int64), torch.empty(0)
 
-    def take(
-        self,
-        problem: ReachAvoidProblem,
-        count: int,
-        max_steps: int,
-        rng: torch.Generator,
-        dtype: torch.dtype,
-        visited: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor]:
-        """Take `count` initial states; the arguments and the result are those of `InitialStates.sample`."""
+    def take(self, count: int, draw: Draw) -> tuple[Tensor, Tensor]:
+        """Take `count` initial states, control steps to go (count,) and states (count, n); `draw` gives new ones."""
         if len(self._steps) < count:
             # The few that are left are dropped: they do not depend on what was taken, so that this adds no bias.
-            self._steps, self._states = self.distribution.sample(problem, self.size, max_steps, rng, dtype, visited)
+            self._steps, self._states = draw(self.size)
         steps, self._steps = self._steps[:count], self._steps[count:]
         states, self._states = self._states[:count], self._states[count:]
-        return steps.to(rng.device), states.to(rng.device)  # a checkpoint is loaded on the CPU
+        return steps, states  # on the CPU where they come from a checkpoint
 
     def state_dict(self) -> dict[str, Any]:
         """The initial states that are left, which an exact continuation needs."""
