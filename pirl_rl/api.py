@@ -117,7 +117,7 @@ def evaluate(run: Run | str | PathLike[str], *, trust: Sequence[str] = (), **set
         ConfigError: for an unknown setting, or a value that cannot be built; the message lists the known settings.
     """
     if not isinstance(run, Run):
-        run = load_run(Path(run), trust)
+        run = load_run(run, trust)
     config = copy.deepcopy(run.config)
     typed = typed_settings(settings, config, "evaluation")
     for text in typed:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from numbers import Integral
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -68,7 +70,12 @@ def checked_policy(policy: Policy, problem: ReachAvoidProblem) -> Policy:
 
     The function that is returned raises an ArgumentError where the controls have another shape than (N, m), are not
     finite, or lie outside `problem.controls`.
+
+    Raises:
+        ArgumentError: the policy is no function.
     """
+    if not callable(policy):
+        raise ArgumentError(f"policy: expected a function of tau and x, got {policy!r}")
     allowed = problem.controls.expand(1 + CONTROL_ROUNDING)
 
     def checked(tau: Tensor, x: Tensor) -> Tensor:
@@ -92,7 +99,21 @@ def checked_policy(policy: Policy, problem: ReachAvoidProblem) -> Policy:
     return checked
 
 
+def seeded(seed: int, device: torch.device) -> torch.Generator:
+    """A random generator with a seed.
+
+    Raises:
+        ArgumentError: the seed is no integer.
+    """
+    if not isinstance(seed, Integral):
+        raise ArgumentError(f"seed: expected an integer, got {seed!r}")
+    return torch.Generator(device).manual_seed(int(seed))
+
+
 def _numbers(name: str, given: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
+    # Of a complex array torch would take the real part.
+    if isinstance(given, (Tensor, np.ndarray)) and "complex" in str(given.dtype):
+        raise ArgumentError(f"{name}: expected real numbers, got complex ones")
     try:
         return torch.as_tensor(given, dtype=dtype, device=device)
     except (TypeError, ValueError, RuntimeError) as error:

@@ -15,13 +15,13 @@ from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from pirl_rl.building import build, convert
 from pirl_rl.curriculum import Stage
 from pirl_rl.envs import ReachAvoidEnv
-from pirl_rl.errors import ConfigError
+from pirl_rl.errors import ArgumentError, ConfigError
 from pirl_rl.evaluation import Evaluator
 from pirl_rl.grid import GridSolver
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.problem import ReachAvoidProblem, check_problem
 from pirl_rl.simulator import Simulator
-from pirl_rl.time_steps import propose_time_steps
+from pirl_rl.time_steps import check_time_steps, propose_time_steps
 from pirl_rl.trainer import Trainer
 
 AUTO = "auto"
@@ -146,16 +146,19 @@ def choose_time_steps(config: DictConfig, problem: ReachAvoidProblem) -> None:
     """Replace `auto` in env.dt and env.substeps by numbers, and print the choice with its reason.
 
     Raises:
-        ConfigError: one of the two is neither `auto` nor a number.
+        ConfigError: one of the two is neither `auto` nor a number, or out of range.
         ProblemError: the problem contradicts itself.
-        ArgumentError: the other of the two is out of range.
     """
     kinds = {"dt": float, "substeps": int}
     values = {name: config.env[name] for name in kinds if name in config.env}
-    if AUTO not in values.values():
-        return
     given = {name: convert(value, kinds[name], f"env.{name}") for name, value in values.items() if value != AUTO}
     check_problem(problem)
+    try:
+        check_time_steps(problem, given.get("dt"), given.get("substeps"))
+    except ArgumentError as error:
+        raise ConfigError(f"env.{error}") from None
+    if AUTO not in values.values():
+        return
     chosen = propose_time_steps(problem, **given)
     config.env.dt, config.env.substeps = chosen.dt, chosen.substeps
     print(f"time: {chosen.reason}", flush=True)
@@ -173,7 +176,7 @@ def choose_paths(config: DictConfig, problem: ReachAvoidProblem) -> None:
     Otherwise the evaluation of a problem with a hundred states would take longer than its training. The time steps must
     have been chosen before.
     """
-    simulator = config.evaluation.simulator
+    simulator = make_evaluation_simulator(config, problem)
     moves = problem.horizon / simulator.dt * simulator.substeps * problem.states.dim
     for (evaluator, argument), (most, least) in PATHS.items():
         if config.evaluation.get(evaluator, {}).get(argument) == AUTO:

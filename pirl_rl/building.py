@@ -51,7 +51,10 @@ def build(node: Any, key: str, trust: Sequence[str] = (), parts: Mapping[str, An
         return constructor(**values, **extra)
     except PirlError as error:
         message = str(error)
-        raise ConfigError(message if message.startswith(f"{key}.") else f"{key}: {message}") from error
+        argument = message.partition(":")[0].partition(".")[0]
+        if message.startswith((f"{key}.", f"{key}:")):
+            raise ConfigError(message) from error
+        raise ConfigError(f"{key}{'.' if argument in parameters_of(constructor) else ': '}{message}") from error
 
 
 def _value(node: DictConfig | ListConfig, name: Any, key: str, trust: Sequence[str], parts: Mapping[str, Any]) -> Any:

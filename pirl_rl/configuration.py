@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ REFERENCE = re.compile(r"\$\{[\w.]+\}")
 """A reference to another key of the configuration."""
 
 
-def load_config(folder: str | Path) -> DictConfig:
+def load_config(folder: str | PathLike[str]) -> DictConfig:
     """The configuration of a run directory, converted to the current format.
 
     It may refer to its own keys, as in `${env.dt}`, but call no resolver: `${oc.env:TOKEN}` would read a secret of the
@@ -41,6 +42,8 @@ def load_config(folder: str | Path) -> DictConfig:
         config = OmegaConf.load(path)
         if not isinstance(config, DictConfig):
             raise ConfigError(f"{path}: expected a mapping, got {type(config).__name__}")
+        if not config:
+            raise ConfigError(f"{path}: expected the settings of a run, got an empty file")
         raw = OmegaConf.to_container(config, resolve=False)
         _refuse_resolvers(raw, str(path))
         written_in = config.pop("format", 1)

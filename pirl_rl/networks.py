@@ -39,6 +39,8 @@ def _stack(
     scaling: Box | None,
     levels: bool,
 ) -> nn.Sequential:
+    if not all(isinstance(width, int) and width >= 1 for width in hidden):
+        raise ArgumentError(f"hidden: expected widths of layers, integers >= 1, got {list(hidden)}")
     box = _with_periods(scaling or problem.states, problem.states)
     low, high = (0.0, *box.low, *[-1.0] * controls), (problem.horizon, *box.high, *[1.0] * controls)
     layers: list[nn.Module] = []

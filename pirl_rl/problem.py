@@ -189,15 +189,15 @@ def check_problem(problem: ReachAvoidProblem, points: int = 100_000, seed: int =
         seed: the seed of these states.
 
     Raises:
-        ProblemError: an attribute is missing, the horizon is not positive, a control is periodic, an output has the
-            wrong shape or differs at both ends of a period, or a sampled state lies in both A and B.
+        ProblemError: an attribute is missing, the horizon is not positive or not finite, a control is periodic, an
+            output has the wrong shape or differs at both ends of a period, or a sampled state lies in both A and B.
     """
     name = type(problem).__name__
     for attribute in ("horizon", "states", "controls"):
         if not hasattr(problem, attribute):
             raise ProblemError(f"{name} has no {attribute}")
-    if not problem.horizon > 0:
-        raise ProblemError(f"{name}: horizon must be positive, got {problem.horizon}")
+    if not 0 < problem.horizon < float("inf"):
+        raise ProblemError(f"{name}: horizon must be positive and finite, got {problem.horizon}")
     if problem.controls.periodic:
         raise ProblemError(f"{name}.controls: only states may be periodic, got {problem.controls}")
     rng = torch.Generator().manual_seed(seed)

@@ -58,7 +58,10 @@ class RunDirectory:
             OSError: the file cannot be read.
             ValueError: it is no JSON object.
         """
-        entries = json.loads(self.summary.read_text(encoding="utf-8"))
+        try:
+            entries = json.loads(self.summary.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise ValueError(f"{self.summary}: {error}") from None
         if not isinstance(entries, dict):
             raise ValueError(f"{self.summary}: expected a JSON object, got {type(entries).__name__}")
         return {name: value for name, value in entries.items() if not isinstance(value, str)}

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from numbers import Real
 from typing import Literal, NamedTuple
 
 import torch
@@ -77,8 +78,8 @@ class Simulator:
     compile: bool | None = None
 
     def __post_init__(self):
-        if not 0 < self.dt <= self.problem.horizon:
-            raise ArgumentError(f"dt: expected 0 < dt <= horizon = {self.problem.horizon}, got {self.dt}")
+        if not (isinstance(self.dt, Real) and 0 < self.dt <= self.problem.horizon):
+            raise ArgumentError(f"dt: expected 0 < dt <= horizon = {self.problem.horizon}, got {self.dt!r}")
         if not (isinstance(self.substeps, int) and self.substeps >= 1):
             raise ArgumentError(f"substeps: expected an integer >= 1, got {self.substeps!r}")
         if self.crossing not in ("bridge", "endpoint"):

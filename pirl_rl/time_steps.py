@@ -73,6 +73,7 @@ def propose_time_steps(
     """
     if samples < 1:
         raise ArgumentError(f"samples: expected at least 1, got {samples}")
+    check_time_steps(problem, dt, substeps)
     x, u = _samples(problem, samples, seed)
     moves, rate = [across_box(problem, x, u), *across_sets(problem, x, u)], fastest_rate(problem, x, u)
     chosen, limit = _control_step(problem.horizon, moves) if dt is None else (dt, "")
@@ -87,6 +88,15 @@ def propose_time_steps(
         f"{rate:.3g} 1/s; ten times as many integration steps change it by {error:.1g} of the box.",
     )
     return TimeSteps(chosen, count, moves, error, " ".join(filter(None, sentences)))
+
+
+def check_time_steps(problem: ReachAvoidProblem, dt: float | None, substeps: int | None) -> None:
+    """Refuse time steps that are out of range; None is a step that is still to be chosen.
+
+    Raises:
+        ArgumentError: `dt` is not in (0, horizon], or `substeps` is below 1.
+    """
+    Simulator(problem, problem.horizon if dt is None else dt, 1 if substeps is None else substeps)
 
 
 def _samples(problem: ReachAvoidProblem, count: int, seed: int) -> tuple[Tensor, Tensor]:

@@ -1,7 +1,9 @@
-"""Reports of errors by the commands: a refused setting is one line, a bug keeps its traceback and names its place."""
+"""Reports of errors by the commands: a refused setting or a bug of the user is one line, another has its traceback."""
 
 from __future__ import annotations
 
+import inspect
+import shlex
 import sys
 from pathlib import Path
 
@@ -19,8 +21,10 @@ from pirl_rl.problems import Reach1D
 OWN = ("+experiment=own", *QUICK[1:])
 
 BROKEN = """
+import os, signal
 import torch
 from pirl_rl.errors import ArgumentError
+from pirl_rl.loggers import CSVLogger
 from pirl_rl.problems import Reach1D
 
 class Buggy(Reach1D):
@@ -38,6 +42,12 @@ class Mistaken(Reach1D):
 class Library(Reach1D):
     def drift(self, x, u):
         return torch.cat([x, u.mT], -1)
+
+
+class Interrupts(CSVLogger):
+    def log(self, row):
+        super().log(row)
+        os.kill(os.getpid(), signal.SIGINT)
 """
 
 
@@ -60,11 +70,13 @@ def cli(in_process, tmp_path, monkeypatch):
         ("unreadable.Half", 1, "error: SyntaxError: invalid syntax"),
     ],
 )
-def test_a_bug_of_the_user_s_keeps_its_traceback(target, line, last, cli, tmp_path):
+@pytest.mark.parametrize("full", [False, True])
+def test_a_bug_of_the_user_s_is_one_line_with_its_place(full, target, line, last, cli, tmp_path, monkeypatch):
     before = sorted(path.name for path in tmp_path.iterdir())
+    monkeypatch.setenv("HYDRA_FULL_ERROR", str(int(full)))
     code, text = cli(*OWN, f"env.problem._target_={target}")
     assert code == 1
-    assert "Traceback (most recent call last)" in text
+    assert ("Traceback (most recent call last)" in text) == full
     final = text.strip().splitlines()[-1]
     assert final.startswith(last)
     assert final.endswith(f"({tmp_path / target.partition('.')[0]}.py, line {line})")
@@ -95,15 +107,31 @@ def test_all_our_errors_are_one_line(error, capsys):
 
 
 def test_a_bug_without_the_user_s_code_names_no_place(capsys, monkeypatch):
-    monkeypatch.setattr("pirl_rl.commands.console.LIBRARIES", (Path("/"),))
+    monkeypatch.setattr("pirl_rl.places.LIBRARIES", (Path("/"),))
     with pytest.raises(SystemExit), reported(Path()):
         Reach1D().nothing  # noqa: B018
-    *_, last = capsys.readouterr().err.splitlines()
+    first, *_, last = capsys.readouterr().err.splitlines()
+    assert first == "Traceback (most recent call last):"
     assert last == "error: AttributeError: 'Reach1D' object has no attribute 'nothing'"
 
 
 def test_other_jobs_of_a_sweep_go_on(capsys):
+    raised_at = inspect.currentframe().f_lineno + 3
     for error in (ConfigError("a"), RuntimeError("a")):
         with pytest.raises(CompactHydraException), reported(Path(), one_of_many=True):
             raise error
-    assert "Traceback" in capsys.readouterr().err
+    assert [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")] == [
+        "error: a",
+        f"error: RuntimeError: a ({__file__}, line {raised_at})",
+    ]
+
+
+def test_the_line_after_an_interrupt_can_be_pasted(cli):
+    """It trusts the modules that the first command named."""
+    own = (*QUICK, "trainer.log_every=20", "trainer.evaluate_every=0", "logger._target_=broken.Interrupts")
+    code, text = cli(*own)
+    assert code == 130
+    _, _, line = text.strip().splitlines()[-1].partition("resume with: python -m pirl_rl.train ")
+    assert shlex.split(line)[1] == "trust=[broken]"
+    code, text = cli(*shlex.split(line))
+    assert code == 0, text

@@ -226,7 +226,7 @@ class ColumnAvoid(Reach1D):
     ("problem", "message"),
     [
         (NoHorizon, "NoHorizon has no horizon"),
-        (Backwards, "Backwards: horizon must be positive, got -1.0"),
+        (Backwards, "Backwards: horizon must be positive and finite, got -1.0"),
         (ScalarDrift, r"ScalarDrift.drift: expected shape \(16, 1\) for 16 states, got \(16,\)"),
         (FlatDiffusion, r"FlatDiffusion.diffusion: expected shape \(\*, 1, w\), got \(16, 1\)"),
         (WideDiffusion, r"WideDiffusion.diffusion: expected shape \(16, 1, 3\) for 16 states, got \(16, 2, 3\)"),

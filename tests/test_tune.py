@@ -8,7 +8,7 @@ import sys
 
 import pytest
 from rounds import FakeTrain, answer, candidate
-from small import TUNED
+from small import TUNED, small_trainer
 
 from pirl_rl.commands import tune
 from pirl_rl.configuration import load_config
@@ -111,6 +111,22 @@ def test_a_program_s_line_is_typed_as_for_any_shell(cli, trained, tmp_path):
     assert resumed[-1] != typed[-1]
     assert cli(*resumed)[0] == 0
     assert sys.argv[1:] == resumed
+
+
+def test_the_candidates_have_the_method_of_their_start(cli, trained, tmp_path):
+    td3 = tmp_path / "td3"
+    small_trainer(td3, "method=td3", "trainer.updates=5").train()
+    line = (*TUNED, "rounds=1", "candidates=1", "updates=10")
+    for start, typed, expected in ((td3, (), "td3"), (td3, ("method=td3",), "td3"), (trained, (), None)):
+        out = tmp_path / f"{start.name}-{len(typed)}"
+        code, text = cli(*line, *typed, f"start={start}", f"out={out}")
+        assert code == 0, text
+        (log,) = out.rglob("*.log")
+        words = shlex.split(log.read_text().splitlines()[0])
+        assert [word for word in words if word.startswith("method=")] == ([f"method={expected}"] if expected else [])
+    code, text = cli(*line, "method=pirl", f"start={td3}")
+    assert code == 1
+    assert "does not fit" in text
 
 
 def test_report_needs_a_loop(cli, tmp_path):

@@ -12,9 +12,10 @@ from collections.abc import Callable, Iterable, Iterator
 from pirl_rl.checking import answers, dynamics, level_sets, methods
 from pirl_rl.checking.findings import Finding, found, method_that_raised, raised_in, report
 from pirl_rl.checking.samples import Samples
-from pirl_rl.errors import ProblemError
+from pirl_rl.errors import ArgumentError, ProblemError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sets import Box
+from pirl_rl.time_steps import check_time_steps
 
 __all__ = ["Finding", "check", "examine", "report"]
 
@@ -40,10 +41,16 @@ def examine(problem: ReachAvoidProblem, dt: float | None = None, substeps: int |
         problem: the problem.
         dt: the control step with which it will be simulated, in s; by default the one that is proposed.
         substeps: the number of integration steps in a control step; by default the proposed number.
+
+    Raises:
+        ArgumentError: `problem` is no problem, or a time step is out of range.
     """
+    if not isinstance(problem, ReachAvoidProblem):
+        raise ArgumentError(f"problem: expected an object of a subclass of ReachAvoidProblem, got {problem!r}")
     findings = [*attributes(problem)]
     if findings:
         return findings
+    check_time_steps(problem, dt, substeps)
     samples = Samples(problem)
     groups: list[list[Check]] = [
         [methods.calls],

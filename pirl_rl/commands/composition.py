@@ -15,10 +15,16 @@ from typing import Any
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
 
 from pirl_rl.building import parameters_of, resolve
 from pirl_rl.configuration import CONF
+from pirl_rl.errors import ConfigError
+
+OTHER_FOLDERS = ("-cd", "-cp", "--config-dir", "--config-path", "hydra.searchpath")
+"""Settings of Hydra that add folders with choices of one's own to those of `conf/`."""
 
 REFERENCE = re.compile(r"^\s*- /arguments/([\w.]+)@", re.MULTILINE)
 
@@ -101,6 +107,35 @@ def drop_leftovers(config: DictConfig, typed: Sequence[str], trust: Sequence[str
                     del node[name]
 
 
+def check_overrides(texts: Sequence[str]) -> None:
+    """Refuse overrides that cannot be read, and unknown choices of a group of `conf/`, which Hydra reports in 26 lines.
+
+    Args:
+        texts: overrides `key=value`; flags of Hydra among them are skipped.
+
+    Raises:
+        ConfigError: with the override, or with the choices of its group.
+    """
+    parser = OverridesParser.create()
+    for text in texts:
+        if text.startswith("-") or "=" not in text:
+            continue
+        try:
+            override = parser.parse_override(text)
+        except HydraException as error:
+            reason = str(error).partition("\n")[0]
+            raise ConfigError(f"{text}: expected key=value in the grammar of Hydra ({reason})") from None
+        key, chosen = override.key_or_group, None if override.is_sweep_override() else override.value()
+        if not key:
+            raise ConfigError(f"{text}: expected key=value, got no key")
+        group = CONF / key
+        if not (group.is_dir() and isinstance(chosen, str)) or any(text.startswith(OTHER_FOLDERS) for text in texts):
+            continue
+        if not (group / f"{chosen}.yaml").is_file():
+            known = ", ".join(sorted(path.stem for path in group.glob("*.yaml")))
+            raise ConfigError(f"{key}: expected one of {known}, got {chosen!r}")
+
+
 def compose(name: str, overrides: Sequence[str], with_hydra: bool = False) -> DictConfig:
     """Compose a configuration from a primary file of `conf/` and overrides.
 
@@ -110,7 +145,12 @@ def compose(name: str, overrides: Sequence[str], with_hydra: bool = False) -> Di
         name: the primary file, "train" or "tune".
         overrides: overrides `key=value`, as on a command line.
         with_hydra: whether the configuration contains the settings of Hydra, under `hydra`.
+
+    Raises:
+        ConfigError: for an override that cannot be read, or an unknown choice of a group.
+        HydraException: for an unknown key.
     """
+    check_overrides(overrides)
     register()
     active = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import os
+import shlex
 import sys
 import textwrap
 import traceback
@@ -78,20 +80,23 @@ def override(config: DictConfig, text: str) -> tuple[Any, Any]:
 
 
 @contextlib.contextmanager
-def reported(folder: Path, one_of_many: bool = False) -> Iterator[None]:
+def reported(folder: Path, one_of_many: bool = False, again: Sequence[str] = ()) -> Iterator[None]:
     """Turn errors into messages and an exit code.
 
-    An expected error, such as a refused setting, becomes one line. Any other error is a bug in this package or in the
-    user's code: its traceback is printed, with a last line that names the place in the user's code.
+    An expected error, such as a refused setting, becomes one line. So does an error in the user's code, with the place
+    there; HYDRA_FULL_ERROR=1 in the environment prints its traceback too. Any other error is a bug in this package, and
+    its traceback is printed.
 
     Args:
         folder: the run directory, for the hint on how to resume.
         one_of_many: whether this is a job of a sweep, whose other jobs still run.
+        again: further arguments that a resumed run needs, for the hint.
     """
     try:
         yield
     except Interrupted as stop:
-        print(f"{stop}; resume with: python -m pirl_rl.train resume={folder}", file=sys.stderr)
+        line = shlex.join([f"resume={folder}", *again])
+        print(f"{stop}; resume with: python -m pirl_rl.train {line}", file=sys.stderr)
         raise SystemExit(INTERRUPTED) from None
     except EXPECTED as error:
         _end(f"error: {_one_line(error)}", one_of_many)
@@ -100,8 +105,11 @@ def reported(folder: Path, one_of_many: bool = False) -> Iterator[None]:
             traceback.print_exc()
         _end(f"error: {error.strerror or error}: {error.filename or folder}", one_of_many)
     except Exception as error:
-        traceback.print_exc()
-        _end(f"error: {type(error).__name__}: {_first_line(str(error))}{_users_place(error)}", one_of_many)
+        place = _users_place(error)
+        if not place or os.environ.get("HYDRA_FULL_ERROR") == "1":
+            traceback.print_exc()
+        reason = error.msg if isinstance(error, SyntaxError) else str(error)  # whose text repeats the place
+        _end(f"error: {type(error).__name__}: {_first_line(reason)}{place}", one_of_many)
 
 
 def _end(message: str, one_of_many: bool) -> None:

@@ -10,6 +10,9 @@ import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
 
 from pirl_rl import checkpoint
 from pirl_rl.checkpoint import TARGET
@@ -36,22 +39,36 @@ def export(run: Path, out: Path) -> Path:
         CheckpointError: if the checkpoint is missing or broken.
     """
     config = load_config(run)
-    source, copy = RunDirectory(run), RunDirectory(out)
+    source = RunDirectory(run)
     state = checkpoint.load(source.newest())
     source.refuse_links()
     if out.exists():
         raise ConfigError(f"out: expected a new folder, but {out} exists, and an export never overwrites anything")
     if "start" in config:
         config.start = None  # a path that means nothing elsewhere
-    save_config(config, out)
+    # The folder gets its name at the end, so that an export that is killed leaves none that looks complete.
+    draft = out.with_name(f".{out.name}.draft")
+    shutil.rmtree(draft, ignore_errors=True)
+    try:
+        path = _write(source, config, state, RunDirectory(draft))
+        draft.rename(out)
+    except BaseException:
+        shutil.rmtree(draft, ignore_errors=True)
+        raise
+    return out / path.relative_to(draft)
+
+
+def _write(source: RunDirectory, config: DictConfig, state: dict[str, Any], copy: RunDirectory) -> Path:
+    """Write the files of an export; returns the path of the networks."""
+    save_config(config, copy.path)
     loss = {name: entry for name, entry in checkpoint.loss_state(state).items() if not name.startswith(TARGET)}
     path = copy.weights(state["update"])
     checkpoint.save({"loss": loss, "update": state["update"]}, path)
     for name in COPIED:
-        if (run / name).is_dir():
-            shutil.copytree(run / name, out / name)
-        elif (run / name).is_file():
-            shutil.copyfile(run / name, out / name)
+        if (source.path / name).is_dir():
+            shutil.copytree(source.path / name, copy.path / name)
+        elif (source.path / name).is_file():
+            shutil.copyfile(source.path / name, copy.path / name)
     return path
 
 

@@ -18,11 +18,11 @@ from omegaconf import DictConfig, OmegaConf
 from pirl_rl.assembly import make_problem, make_trainer
 from pirl_rl.commands.catalogue import choices
 from pirl_rl.commands.check import check_before_training
-from pirl_rl.commands.composition import drop_leftovers, register
+from pirl_rl.commands.composition import check_overrides, drop_leftovers, register
 from pirl_rl.commands.console import named_modules, outcome, override, quiet_libraries, reported
-from pirl_rl.commands.methods import check_method
+from pirl_rl.commands.methods import check_method, method_of
 from pirl_rl.commands.solve import solve
-from pirl_rl.configuration import CONF, load_config, save_config
+from pirl_rl.configuration import CONF, PACKAGE, load_config, save_config
 from pirl_rl.continuation import restore, start_from
 from pirl_rl.errors import INTERRUPTED, CheckpointError, ConfigError
 from pirl_rl.evaluation import lines_of, meanings_of
@@ -43,8 +43,11 @@ def train(config: DictConfig) -> float:
     """Train a new run in Hydra's run directory; returns the error that an optimising sweeper can minimise."""
     hydra_config = HydraConfig.get()
     folder = Path(hydra_config.runtime.output_dir)
-    with reported(folder, one_of_many=hydra_config.mode == RunMode.MULTIRUN):
-        summary = train_new(config, folder, hydra_config.overrides.task)
+    overrides = hydra_config.overrides.task
+    foreign = dict.fromkeys(name for name in [*config.trust, *named_modules(overrides)] if name != PACKAGE.name)
+    again = [f"trust=[{','.join(foreign)}]"] if foreign else []
+    with reported(folder, one_of_many=hydra_config.mode == RunMode.MULTIRUN, again=again):
+        summary = train_new(config, folder, overrides)
     return summary.get("value_mse", summary.get("hjb_sup_loss", float("nan")))
 
 
@@ -88,7 +91,8 @@ def train_new(
 def resume(folder: Path, overrides: Sequence[str]) -> None:
     """Resume a run, with overrides `key=value` that change its configuration for good."""
     run = RunDirectory(folder)
-    with reported(folder), contextlib.ExitStack() as held:
+    trust = [text for text in overrides if text.startswith("trust=")]
+    with reported(folder, again=trust), contextlib.ExitStack() as held:
         config = load_config(folder)
         run.refuse_links()
         held.enter_context(locked(run))
@@ -127,8 +131,7 @@ def _start(trainer: Trainer, config: DictConfig) -> None:
     try:
         config.start = str(start_from(trainer, start))
     except CheckpointError as error:
-        run = RunDirectory(start) if Path(start).is_dir() else RunDirectory.of_checkpoint(Path(start))
-        method = load_config(run.path).get("method_name") if run.config.is_file() else None
+        method = method_of(start)
         if method in (None, config.method_name):
             raise
         raise CheckpointError(
@@ -154,9 +157,10 @@ def _new(folder: Path) -> Iterator[None]:
     """Create a run directory. It is removed if the run ends before its first row of metrics, checkpoint or grid.
 
     Raises:
-        ConfigError: if the directory is not empty.
+        ConfigError: if the directory is not empty, or a file lies in its place.
         RunError: if another process has just begun a run there.
     """
+    _refuse_files(folder)
     folder.mkdir(parents=True, exist_ok=True)
     run = RunDirectory(folder)
     if not run.unused():
@@ -175,6 +179,18 @@ def _new(folder: Path) -> Iterator[None]:
             raise
 
 
+def _folders(arguments: Sequence[str]) -> list[Path]:
+    """The run directories that overrides name, which Hydra creates before it calls `train`."""
+    named = (text.partition("=") for text in arguments)
+    return [Path(path) for key, _, path in named if key in ("hydra.run.dir", "hydra.sweep.dir")]
+
+
+def _refuse_files(folder: Path) -> None:
+    for path in (folder, *folder.parents):
+        if path.exists() and not path.is_dir():
+            raise ConfigError(f"hydra.run.dir: expected a directory, but {path} is a file")
+
+
 def main() -> None:
     quiet_libraries()
     arguments = sys.argv[1:]
@@ -187,6 +203,10 @@ def main() -> None:
             folder = Path(resumed[-1].partition("=")[2])
             resume(folder, [item for item in arguments if item not in resumed])
         else:
+            with reported(Path()):
+                check_overrides(arguments)
+                for folder in _folders(arguments):
+                    _refuse_files(folder)
             register()
             train()
     except KeyboardInterrupt:

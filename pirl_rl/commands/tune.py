@@ -22,8 +22,9 @@ from omegaconf import DictConfig, OmegaConf
 from pirl_rl.assembly import make_trainer
 from pirl_rl.building import build, convert
 from pirl_rl.commands.baseline import measure
-from pirl_rl.commands.composition import compose, drop_leftovers, register
+from pirl_rl.commands.composition import check_overrides, compose, drop_leftovers, register
 from pirl_rl.commands.console import named_modules, quiet_libraries, reported
+from pirl_rl.commands.methods import method_of
 from pirl_rl.configuration import CONF
 from pirl_rl.continuation import start_from
 from pirl_rl.errors import INTERRUPTED, ConfigError
@@ -63,7 +64,7 @@ def tune(config: DictConfig) -> None:
     out = Path(HydraConfig.get().runtime.output_dir)
     with reported(out), _tidy(out), _resumable(out):
         counts = {name: _count(config, name) for name in COUNTS}
-        train = [*_for_training(typed), *_frequent_evaluation(config)]
+        train = [*_method(config, typed), *_for_training(typed), *_frequent_evaluation(config)]
         trust = [*config.trust, *named_modules(typed)]
         advisor = build(config.advisor, "advisor", trust)
         trainer, path, final = _first(config, train, trust)
@@ -139,6 +140,14 @@ def _frequent_evaluation(config: DictConfig) -> list[str]:
     """An override for experiments that are made for longer runs, with at least `EVALUATIONS` evaluations."""
     every, most = config.trainer.evaluate_every, max(1, config.updates // EVALUATIONS)
     return [f"trainer.evaluate_every={most}"] if isinstance(every, int) and every > most else []
+
+
+def _method(config: DictConfig, typed: Sequence[str]) -> list[str]:
+    """An override for the method of the start, whose networks the candidates continue, unless another one was typed."""
+    if any(text.partition("=")[0].lstrip("+") == "method" for text in typed) or not isinstance(config.start, str):
+        return []
+    method = method_of(config.start)
+    return [] if method in (None, config.method_name) else [f"method={method}"]
 
 
 def _within(key: str, name: str) -> bool:
@@ -236,6 +245,7 @@ def main() -> None:
     with reported(Path()):
         if {"-m", "--multirun"} & {*arguments}:
             raise ConfigError("-m: a loop runs its candidates itself, expected candidates=... and parallel=... instead")
+        check_overrides(arguments)
     register()
     try:
         tune()

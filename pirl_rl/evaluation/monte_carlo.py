@@ -6,6 +6,7 @@ indicator it is the probability to reach A before B within tau or, in an invaria
 
 from __future__ import annotations
 
+from numbers import Real
 from statistics import NormalDist
 from typing import Literal, NamedTuple, TypeVar
 
@@ -13,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pirl_rl.arguments import Policy, checked_points, checked_policy
+from pirl_rl.arguments import Policy, checked_points, checked_policy, seeded
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator, Step, exit_value
@@ -56,9 +57,9 @@ def wilson_interval(successes: Array, trials: int, confidence: float = 0.95) -> 
     Raises:
         ArgumentError: if there is no trial, or the confidence is not in (0, 1).
     """
-    if trials < 1 or not 0 < confidence < 1:
+    if trials < 1 or not (isinstance(confidence, Real) and 0 < confidence < 1):
         raise ArgumentError(
-            f"wilson_interval: expected trials >= 1 and 0 < confidence < 1, got {trials} and {confidence}"
+            f"wilson_interval: expected trials >= 1 and 0 < confidence < 1, got {trials} and {confidence!r}"
         )
     z2 = NormalDist().inv_cdf((1 + confidence) / 2) ** 2 / trials
 
@@ -107,10 +108,10 @@ def monte_carlo(
     times, points = checked_points(problem, tau, x, *kind)
     if points.ndim != 2:
         raise ArgumentError(f"x: expected states of shape (N, {problem.states.dim}), got {tuple(points.shape)}")
-    if rollouts < 1:
-        raise ArgumentError(f"rollouts: expected >= 1, got {rollouts}")
+    if not (isinstance(rollouts, int) and rollouts >= 1):
+        raise ArgumentError(f"rollouts: expected an integer >= 1, got {rollouts!r}")
     simulator = Simulator(problem, dt, substeps, crossing)
-    rng = torch.Generator(points.device).manual_seed(seed)
+    rng = seeded(seed, points.device)
     mean = mean_payoff(simulator, checked_policy(policy, problem), times, points, rollouts, rng)
     known = _known(problem, times, problem.states.wrap(points))[0]
     low, high = (torch.where(known, mean, end) for end in wilson_interval(mean * rollouts, rollouts, confidence))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
+from numbers import Real
+from os import PathLike
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -12,7 +13,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from pirl_rl import checkpoint
-from pirl_rl.arguments import checked_points
+from pirl_rl.arguments import checked_points, seeded
 from pirl_rl.ascent import look_ahead_policy
 from pirl_rl.assembly import make_networks, make_problem, make_simulator
 from pirl_rl.checkpoint import check_module
@@ -94,6 +95,9 @@ class Run:
 
     def reach_avoid_set(self, p: float, tau: float) -> Callable:
         """The set {x : V(tau, x) > p}, Eq. (ra_levelset), as a function that maps states (*, n) to (*) bool."""
+        if not (isinstance(p, Real) and 0 <= p <= 1):
+            raise ArgumentError(f"p: expected a probability in [0, 1], got {p!r}")
+        self._arguments(tau, [self.problem.states.low])  # refuses a wrong time to go at once
         return lambda x: self.value(tau, x) > p
 
     def simulate(
@@ -116,7 +120,7 @@ class Run:
             seed: seed of the noise.
         """
         times, state, answer = self._starts(tau, x)
-        rng = torch.Generator(state.device).manual_seed(seed)
+        rng = seeded(seed, state.device)
         paths = closed_loop(self._simulator(dt, substeps, crossing), self.solution.policy, times, state, rng)
         return Trajectories(**{name: answer(entry) for name, entry in vars(paths).items()})
 
@@ -180,7 +184,7 @@ def _settings_of(simulator: Simulator) -> dict[str, Any]:
 
 
 def load_run(
-    folder: str | Path,
+    folder: str | PathLike[str],
     trust: Sequence[str] = (),
     weights: str | None = None,
     device: str = "cpu",
@@ -196,10 +200,15 @@ def load_run(
         problem: replaces `env.problem`, for a run that was trained on an object, which no configuration can name.
 
     Raises:
+        ArgumentError: if the folder is no path, or `problem` is no problem.
         ConfigError: if the folder is not a run directory, or its configuration names a class that is not trusted, or no
             problem.
         CheckpointError: if the checkpoint is missing, broken or does not fit the configuration.
     """
+    if not isinstance(folder, (str, PathLike)):
+        raise ArgumentError(f"folder: expected the path of a run directory, got {folder!r}")
+    if not (problem is None or isinstance(problem, ReachAvoidProblem)):
+        raise ArgumentError(f"problem: expected an object of a subclass of ReachAvoidProblem, got {problem!r}")
     run = RunDirectory(folder)
     config = load_config(folder)
     config.device = device

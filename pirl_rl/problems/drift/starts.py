@@ -55,6 +55,11 @@ class EquilibriumStates:
         dtype: torch.dtype,
         visited: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
+        if not isinstance(problem, VehicleDrift):
+            raise ArgumentError(
+                "initial_states: EquilibriumStates gives states of VehicleDrift alone, and the problem is "
+                f"{type(problem).__name__}; expected pirl_rl.sampling.UniformStates or one of your own"
+            )
         x = redrawn(problem, count, lambda missing: self._draw(problem, missing, rng, dtype))
         return steps_to_go(self.tau, count, max_steps, rng), x
 
