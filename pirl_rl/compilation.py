@@ -9,6 +9,8 @@ from typing import Any
 
 import torch
 
+from pirl_rl.progress import announce
+
 FRAME = re.compile(r'File "(.+)", line (\d+)')
 """A place in the code, in the messages of the compiler."""
 
@@ -39,10 +41,13 @@ class Compiled:
     """
 
     def __init__(self, function: Callable[..., Any], name: str):
-        self.function, self.name = function, name
+        self.function, self.name, self._begun = function, name, False
         self._called: Callable[..., Any] = compiled(function, whole=True)
 
     def __call__(self, *args: Any) -> Any:
+        if not self._begun:
+            self._begun = True
+            announce(f"compiling {self.name}")
         try:
             return self._called(*args)
         except Exception as error:

@@ -6,7 +6,7 @@ The command and the function have the same name. So this module can be called, w
 import sys
 from types import ModuleType
 
-from pirl_rl.commands.evaluate import main
+from pirl_rl.progress import announce
 
 
 class _Evaluate(ModuleType):
@@ -19,5 +19,14 @@ class _Evaluate(ModuleType):
 
 sys.modules[__name__].__class__ = _Evaluate
 
+
+def main(*arguments) -> None:
+    """The command, whose imports take some seconds."""
+    from pirl_rl.commands.evaluate import main as command
+
+    command(*arguments)
+
+
 if __name__ == "__main__":
+    announce("loading torch and TorchRL")
     main()

@@ -1,6 +1,15 @@
 """`python -m pirl_rl.export`, see `pirl_rl.commands.export`."""
 
-from pirl_rl.commands.export import main
+from pirl_rl.progress import announce
+
+
+def main(*arguments) -> None:
+    """The command, whose imports take some seconds."""
+    from pirl_rl.commands.export import main as command
+
+    command(*arguments)
+
 
 if __name__ == "__main__":
+    announce("loading torch and TorchRL")
     main()

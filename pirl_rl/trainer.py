@@ -20,7 +20,7 @@ from pirl_rl.files import replacing
 from pirl_rl.guard import Rollback
 from pirl_rl.learner import Learner
 from pirl_rl.loggers import MetricsLogger, NoLogger
-from pirl_rl.progress import Progress, interruptible
+from pirl_rl.progress import Progress, announce, interruptible
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.sampling.batches import BatchSampler
 from pirl_rl.sampling.boundary import BoundarySampler
@@ -160,7 +160,9 @@ class Trainer:
             self._enter_stage()
             if self.rollback is not None and self.rollback.good_at is None:
                 self.rollback.judge(self.update)
+            announce("playing the first transitions")
             self.collector.start()
+            announce("compiling the losses, and training" if self.learner.compile else "training")
             try:
                 self._loop(interrupted)
             except DivergenceError as error:
@@ -217,6 +219,8 @@ class Trainer:
         return row
 
     def _finish(self) -> dict[str, float]:
+        if self.final:
+            announce(f"measuring: {', '.join(self.final)}")
         self.evidence = evaluate(self.solution, self.simulator, self.final)
         summary: dict[str, float] = {
             "updates": self.update,

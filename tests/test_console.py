@@ -21,10 +21,8 @@ from pirl_rl.problems import Reach1D
 OWN = ("+experiment=own", *QUICK[1:])
 
 BROKEN = """
-import os, signal
 import torch
 from pirl_rl.errors import ArgumentError
-from pirl_rl.loggers import CSVLogger
 from pirl_rl.problems import Reach1D
 
 class Buggy(Reach1D):
@@ -43,6 +41,9 @@ class Library(Reach1D):
     def drift(self, x, u):
         return torch.cat([x, u.mT], -1)
 
+
+import os, signal
+from pirl_rl.loggers import CSVLogger
 
 class Interrupts(CSVLogger):
     def log(self, row):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import resource
@@ -201,6 +202,64 @@ def test_a_killed_run_goes_on_and_ends_as_the_uninterrupted_one(seed, finished, 
             arguments = [f"resume={folder}"]
     done = command(*arguments, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
+    assert same_end(RunDirectory(folder), finished)
+    assert RunDirectory(folder).metrics.read_text() == RunDirectory(finished).metrics.read_text()
+
+
+def killed_after(seconds: float, module: str, *arguments: str, cwd: Path) -> None:
+    """Start a command, and kill it after a time unless it has ended."""
+    child = subprocess.Popen(
+        [sys.executable, "-m", module, *arguments], cwd=cwd, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    time.sleep(seconds)
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(20))
+def test_a_killed_evaluation_leaves_a_run_that_opens(seed, run, tmp_path):
+    """Its file has all metrics or is not there."""
+    killed_after(random.Random(seed).uniform(2.0, 8.0), "pirl_rl.evaluate", f"run={run}", cwd=tmp_path)
+    assert load_run(run.path).update == 12
+    if run.evaluation.exists():
+        assert "value_mse" in json.loads(run.evaluation.read_text())
+    done = command(f"run={run}", cwd=tmp_path, module="pirl_rl.evaluate")
+    assert done.returncode == 0, done.stderr
+    assert "value_mse" in json.loads(run.evaluation.read_text())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(20))
+def test_a_killed_export_leaves_a_folder_that_opens_or_none(seed, run, tmp_path):
+    out, line = tmp_path / "out", (f"run={run}", f"out={tmp_path / 'out'}")
+    killed_after(random.Random(seed).uniform(2.0, 4.0), "pirl_rl.export", *line, cwd=tmp_path)
+    if not out.exists():
+        done = command(*line, cwd=tmp_path, module="pirl_rl.export")
+        assert done.returncode == 0, done.stderr
+    assert load_run(out).update == 12
+    assert {path.name for path in tmp_path.iterdir()} == {"copy", "out"}
+    assert RunDirectory(out).summary.read_text() == run.summary.read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(20))
+def test_two_processes_resume_one_directory(seed, finished, tmp_path):
+    """One of them goes on, and the other is refused or finds the run at its end; nothing is mixed."""
+    folder, moments = tmp_path / "run", random.Random(seed)
+    killed_after(moments.uniform(4.0, 7.0), "pirl_rl.train", *RUN, f"hydra.run.dir={folder}", cwd=tmp_path)
+    line = [sys.executable, "-m", "pirl_rl.train"]
+    line += [f"resume={folder}"] if RunDirectory(folder).config.exists() else [*RUN, f"hydra.run.dir={folder}"]
+    both = []
+    for _ in range(2):
+        both.append(subprocess.Popen(line, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True))
+        time.sleep(moments.uniform(0.0, 0.5))
+    told = [process.communicate(timeout=120)[1] for process in both]
+    assert 0 in [process.returncode for process in both], told
+    for process, text in zip(both, told, strict=True):
+        assert "Traceback" not in text
+        if process.returncode:
+            assert "another process writes into this run directory" in text or "expected an empty directory" in text
     assert same_end(RunDirectory(folder), finished)
     assert RunDirectory(folder).metrics.read_text() == RunDirectory(finished).metrics.read_text()
 

@@ -1,4 +1,6 @@
-"""Check a problem before it is trained: `python -m pirl_rl.check my_module:MyProblem [dt=0.01] [substeps=4]`.
+"""Check a problem before it is trained.
+
+    python -m pirl_rl.check my_module:MyProblem [dt=0.01] [substeps=4] [key=value ...]
 
 Finds mistakes in the methods of a problem, its sets and its units, in seconds, and names the method, the line and a
 state at which each can be seen. Ends with exit code 1 where there is an error. Training starts with the same check,
@@ -8,6 +10,10 @@ unless it is given check=false.
     dt                   the control step with which the problem will be simulated, in s; by default the proposed one
     substeps             the number of integration steps in a control step; by default the proposed number
     key=value            any other setting is an argument of the class
+
+Examples:
+    python -m pirl_rl.check my_module:MyProblem
+    python -m pirl_rl.check pirl_rl.problems:HalfSpace dim=30
 """
 
 from __future__ import annotations
@@ -25,12 +31,12 @@ from pirl_rl.checking import Finding, check, examine, report
 from pirl_rl.commands.console import quiet_libraries, reported
 from pirl_rl.errors import ConfigError
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.progress import helped
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
-    if {"-h", "--help"} & {*arguments}:
-        print(__doc__)
+    if helped(arguments, __doc__):
         return
     quiet_libraries()
     with reported(Path()):

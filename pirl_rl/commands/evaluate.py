@@ -1,8 +1,18 @@
-"""Evaluate a run again: `python -m pirl_rl.evaluate run=RUN_DIR [evaluation.success.episodes=100000 ...]`.
+"""Evaluate a run again.
 
-Calls the final evaluators of the run, with the changed settings, writes their metrics and the verdict to
-`evaluation.json` in the run directory, and draws its figures. With verbose=true it prints all metrics with their
-meaning.
+    python -m pirl_rl.evaluate run=RUN_DIR [key=value ...]
+
+Calls the final evaluators of the run, writes their metrics and the verdict to evaluation.json in the run directory, and
+draws its figures.
+
+    run           the directory of a finished run
+    verbose=true  prints all metrics with their meaning
+    key=value     any setting of the run; evaluation.final lists the evaluators
+    trust         modules of your own that the run may import, such as trust=[my_module]
+
+Examples:
+    python -m pirl_rl.evaluate run=runs/reach1d/2026-01-31_12-00-00-0 verbose=true
+    python -m pirl_rl.evaluate run=models/drift evaluation.success.episodes=100000
 """
 
 from __future__ import annotations
@@ -19,14 +29,14 @@ from pirl_rl.errors import ConfigError
 from pirl_rl.evaluation import evaluate, lines_of, meanings_of, metrics_of, statements_of
 from pirl_rl.figures import draw_run
 from pirl_rl.files import replacing
+from pirl_rl.progress import announce, helped
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.runs.load import load_run
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
-    if {"-h", "--help"} & {*arguments}:
-        print(__doc__)
+    if helped(arguments, __doc__):
         return
     named = [item for item in arguments if item.startswith("run=")]
     folder = Path(named[-1].partition("=")[2]) if named else Path()
@@ -44,6 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         evaluators = make_evaluators(config.evaluation, "final", trust)
         solution = load_run(folder, trust, device=config.device).solution
         run.refuse_links()
+        announce(f"measuring: {', '.join(evaluators)}")
         evidence = evaluate(solution, make_evaluation_simulator(config, solution.problem), evaluators)
         metrics = metrics_of(evidence)
         with replacing(run.evaluation) as file:

@@ -1,7 +1,15 @@
-"""Export a run: `python -m pirl_rl.export run=RUN_DIR out=FOLDER`.
+"""Export a run.
+
+    python -m pirl_rl.export run=RUN_DIR out=FOLDER
 
 Copies the files that `load_run` and a reader need: the networks without target networks, replay buffer and optimisers,
 the configuration, the summary, the metrics and the figures.
+
+    run  the run directory
+    out  a new folder
+
+Examples:
+    python -m pirl_rl.export run=runs/drift/2026-01-31_12-00-00-0 out=my_model
 """
 
 from __future__ import annotations
@@ -19,6 +27,7 @@ from pirl_rl.checkpoint import TARGET
 from pirl_rl.commands.console import reported
 from pirl_rl.configuration import load_config, save_config
 from pirl_rl.errors import ConfigError
+from pirl_rl.progress import helped
 from pirl_rl.run_directory import RunDirectory
 
 COPIED = (RunDirectory.SUMMARY, RunDirectory.EVALUATION, RunDirectory.METRICS, RunDirectory.FIGURES)
@@ -74,8 +83,7 @@ def _write(source: RunDirectory, config: DictConfig, state: dict[str, Any], copy
 
 def main(arguments: Sequence[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
-    if {"-h", "--help"} & {*arguments}:
-        print(__doc__)
+    if helped(arguments, __doc__):
         return
     named = dict(item.split("=", 1) for item in arguments if "=" in item)
     with reported(Path(named.get("run", "."))):

@@ -1,17 +1,24 @@
-"""The suite: `python -m pirl_rl.suite [problems=[reach1d,zermelo]] [seeds=[0,1,2]] [out=runs/suite] [key=value ...]`.
+"""Train the suite of problems and compare it with known answers.
+
+    python -m pirl_rl.suite [problems=[NAME,...]] [seeds=[0,1,2]] [against=[grid,lqr,ppo,sac]] [out=DIR] [key=value ...]
 
 Trains each problem with each seed, measures the runs against the truth, and prints one table. What is done already in
-the folder `out` is not repeated, so that a suite that was stopped goes on. Settings `key=value` go to all trainings.
+the folder `out` is not repeated, so that a suite that was stopped goes on.
 
-    problems  names of problems; all by default
-    seeds     seeds of the trainings, [0] by default
-    states    the number of states at which a run is measured, 400 by default
-    rollouts  the number of paths from each of them, 1,000 by default
-    against   alternatives that are measured at the same states, out of grid, lqr, ppo and sac; none by default.
-              The grid is timed until its error is that of the worst run. The others give a policy; ppo and sac are
-              those of Stable-Baselines3, from the extra `baselines`
-    patience  how many times as long as the recipe ppo and sac train, 10 by default
-    out       the folder, runs/suite by default
+    problems   names of problems; all by default
+    seeds      seeds of the trainings, [0] by default
+    states     the number of states at which a run is measured, 400 by default
+    rollouts   the number of paths from each of them, 1,000 by default
+    against    alternatives that are measured at the same states, out of grid, lqr, ppo and sac; none by default.
+               The grid is timed until its error is that of the worst run. The others give a policy; ppo and sac are
+               those of Stable-Baselines3, from the extra `baselines`
+    patience   how many times as long as the recipe ppo and sac train, 10 by default
+    out        the folder, runs/suite by default
+    key=value  any other setting goes to all trainings
+
+Examples:
+    python -m pirl_rl.suite problems=[reach1d,zermelo] seeds=[0,1,2]
+    python -m pirl_rl.suite problems=[quadrotor] against=[lqr,ppo,sac]
 """
 
 from __future__ import annotations
@@ -36,6 +43,7 @@ from pirl_rl.configuration import load_config
 from pirl_rl.errors import ConfigError
 from pirl_rl.figures import draw_suite, save_figures
 from pirl_rl.files import replacing
+from pirl_rl.progress import helped
 from pirl_rl.rivals import RIVALS
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.runs.load import load_run
@@ -69,8 +77,7 @@ STATES_SEED = 30_000
 
 def main(arguments: Sequence[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
-    if {"-h", "--help"} & {*arguments}:
-        print(__doc__)
+    if helped(arguments, __doc__):
         return
     quiet_libraries()
     with reported(Path()):

@@ -1,5 +1,21 @@
-"""Train a new run, `python -m pirl_rl.train +experiment=reach1d [method=...] [start=CHECKPOINT] [key=value ...]`, or
-resume one, `python -m pirl_rl.train resume=RUN_DIR [key=value ...]`.
+"""Train a new run, or resume one.
+
+    python -m pirl_rl.train +experiment=NAME [method=NAME] [start=RUN_DIR] [key=value ...]
+    python -m pirl_rl.train resume=RUN_DIR [key=value ...]
+
+The problem is checked first. The run directory, runs/<experiment>/<time>-<seed> or hydra.run.dir=DIR, has the
+networks, the metrics, the figures and the verdict. `python -m pirl_rl` lists experiments, methods and other choices.
+
+    key=value   any setting; --cfg job prints them all, and --hydra-help the flags of Hydra
+    -m          trains once for each combination of values such as seed=0,1,2
+
+Examples:
+    python -m pirl_rl.train +experiment=reach1d
+    python -m pirl_rl.train +experiment=own env.problem._target_=my_module.MyProblem
+    python -m pirl_rl.train +experiment=reach1d +debug=default
+    python -m pirl_rl.train +experiment=zermelo method=grid
+    python -m pirl_rl.train +experiment=reach1d -m seed=0,1,2
+    python -m pirl_rl.train resume=runs/reach1d/2026-01-31_12-00-00-0 trainer.updates=20000
 """
 
 from __future__ import annotations
@@ -29,6 +45,7 @@ from pirl_rl.evaluation import lines_of, meanings_of
 from pirl_rl.figures import draw_run
 from pirl_rl.lock import locked
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.progress import announce, helped
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.trainer import Trainer
 
@@ -77,6 +94,7 @@ def train_new(
         drop_leftovers(config, overrides, trust)
         problem = make_problem(config, trust) if problem is None else problem
         if config.check:
+            announce("checking the problem")
             check_before_training(config, problem)
         if config.grid is not None:
             return solve(config, folder, overrides, trust, problem)
@@ -194,6 +212,8 @@ def _refuse_files(folder: Path) -> None:
 def main() -> None:
     quiet_libraries()
     arguments = sys.argv[1:]
+    if helped(arguments, __doc__):
+        return
     if not arguments:
         print(NOTHING_NAMED.format(names=", ".join(path.stem for path in choices("experiment"))), file=sys.stderr)
         sys.exit(1)

@@ -1,7 +1,23 @@
-"""Tune: `python -m pirl_rl.tune +experiment=reach1d start=RUN [advisor=NAME] [rounds=3] [candidates=2] [out=DIR] ...`.
+"""Continue a run in rounds, each planned by an advisor.
 
-Continues a run in rounds, each planned by an advisor. A command with the `out` of a stopped loop resumes that loop, and
-`--report out=DIR` writes the report of a loop, finished or not, without training.
+    python -m pirl_rl.tune +experiment=NAME start=RUN_DIR [advisor=NAME] [rounds=3] [candidates=2] [key=value ...]
+    python -m pirl_rl.tune --report out=DIR
+
+A command with the `out` of a stopped loop resumes that loop. --report writes the report of a loop, finished or not,
+without training. The candidates have the method of the start, unless another one is given.
+
+    start       the run directory, or a file in its checkpoints/
+    advisor     plans the rounds; `python -m pirl_rl` lists the advisors
+    rounds      the number of rounds
+    candidates  the number of candidates in each round
+    updates     the number of updates of each candidate
+    parallel    the number of candidates that are trained at a time
+    out         the directory of the loop
+    key=value   any other setting goes to the training of all candidates
+
+Examples:
+    python -m pirl_rl.tune +experiment=reach1d start=runs/reach1d/2026-01-31_12-00-00-0 updates=4000
+    python -m pirl_rl.tune +experiment=drift start=models/drift advisor=optuna rounds=5 out=runs/my_search
 """
 
 from __future__ import annotations
@@ -38,6 +54,7 @@ from pirl_rl.outer_loop.processes import Processes
 from pirl_rl.outer_loop.record import Record
 from pirl_rl.outer_loop.redaction import redact
 from pirl_rl.outer_loop.report import markdown, write_report
+from pirl_rl.progress import helped
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.trainer import Trainer
 
@@ -232,6 +249,8 @@ def _readable(argument: str) -> str:
 
 
 def main() -> None:
+    if helped(sys.argv[1:], __doc__):
+        return
     sys.argv[1:] = arguments = [_readable(text) for text in sys.argv[1:]]
     quiet_libraries()
     if "--report" in arguments:

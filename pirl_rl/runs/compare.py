@@ -1,12 +1,20 @@
 """Compare finished runs in one table and one figure, grouped by experiment and method.
 
-python -m pirl_rl.compare DIR [DIR ...] [--out FOLDER]
+    python -m pirl_rl.compare DIR [DIR ...] [--out FOLDER]
+
+    DIR           run directories, or folders that hold them
+    --out FOLDER  writes comparison.md and comparison.png there; without it the table is printed alone
+
+Examples:
+    python -m pirl_rl.compare runs
+    python -m pirl_rl.compare runs/reach1d models/drift --out runs/comparison
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -18,7 +26,9 @@ from omegaconf.errors import OmegaConfBaseException
 from pirl_rl.errors import RunError
 from pirl_rl.figures.comparison import draw_comparison
 from pirl_rl.figures.files import save_figures
+from pirl_rl.files import replacing
 from pirl_rl.loggers import read_metrics
+from pirl_rl.progress import helped
 from pirl_rl.run_directory import RunDirectory
 
 LOSSES = ("td_loss", "hjb_loss", "hjb_sup_loss", "boundary_loss")
@@ -133,20 +143,22 @@ def format_metric(name: str, value: float) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(prog="python -m pirl_rl.compare", description="Compare finished runs.")
-    parser.add_argument("folders", nargs="+", metavar="DIR", help="run directories, or folders that hold them")
-    parser.add_argument(
-        "--out", metavar="FOLDER", help="folder for comparison.md and comparison.png; default: the first DIR"
-    )
+    if helped(sys.argv[1:] if arguments is None else arguments, __doc__):
+        return
+    parser = argparse.ArgumentParser(prog="python -m pirl_rl.compare", add_help=False)
+    parser.add_argument("folders", nargs="+", metavar="DIR")
+    parser.add_argument("--out", metavar="FOLDER", type=Path)
     options = parser.parse_args(arguments)
     try:
         groups = find_runs(options.folders)
     except RunError as error:
         parser.error(str(error))
-    out = Path(options.out or options.folders[0])
-    out.mkdir(parents=True, exist_ok=True)
     text = comparison_table(groups)
-    (out / "comparison.md").write_text(text)
-    [figure] = save_figures({"comparison": draw_comparison(groups)}, out)
     print(text)
-    print(f"Written: {out / 'comparison.md'}, {figure}")
+    if options.out is None:
+        return
+    path = options.out / "comparison.md"
+    with replacing(path) as file:
+        file.write(text)
+    [figure] = save_figures({"comparison": draw_comparison(groups)}, options.out)
+    print(f"written  {path}\nfigure   {figure}")

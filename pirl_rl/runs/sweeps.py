@@ -1,6 +1,15 @@
-"""The table and the figure of a metric over the settings of a sweep.
+"""Show a metric over the settings of a sweep, in a table and a figure.
 
-python -m pirl_rl.sweeps DIR [--metric value_mse] [--axes KEY [KEY]] [--out FOLDER]
+    python -m pirl_rl.sweeps DIR [--metric NAME] [--axes KEY [KEY]] [--out FOLDER]
+
+    DIR            the directory of a sweep
+    --metric NAME  a key of summary.json, value_mse by default
+    --axes KEY     one or two of the settings that vary
+    --out FOLDER   the folder for sweep.md and sweep.png, by default DIR
+
+Examples:
+    python -m pirl_rl.sweeps multirun/2026-01-31/12-00-00
+    python -m pirl_rl.sweeps multirun/2026-01-31/12-00-00 --metric success_rate --axes schedule.center
 """
 
 from __future__ import annotations
@@ -8,6 +17,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import math
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -21,6 +31,8 @@ from omegaconf.errors import OmegaConfBaseException
 from pirl_rl.errors import RunError
 from pirl_rl.figures.files import save_figures
 from pirl_rl.figures.sweep import draw_grid, draw_line
+from pirl_rl.files import replacing
+from pirl_rl.progress import helped
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.runs.compare import format_metric, read_run
 
@@ -169,20 +181,22 @@ def draw_sweep(sweep: Sweep) -> Figure:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(prog="python -m pirl_rl.sweeps", description="Table and heat map of a sweep.")
-    parser.add_argument("folder", metavar="DIR", type=Path, help="the directory of a sweep")
-    parser.add_argument("--metric", default="value_mse", help="a key of summary.json; default: value_mse")
-    parser.add_argument("--axes", nargs="+", default=(), metavar="KEY", help="one or two of the settings that vary")
-    parser.add_argument("--out", metavar="FOLDER", type=Path, help="folder for sweep.md and sweep.png; default: DIR")
+    if helped(sys.argv[1:] if arguments is None else arguments, __doc__):
+        return
+    parser = argparse.ArgumentParser(prog="python -m pirl_rl.sweeps", add_help=False)
+    parser.add_argument("folder", metavar="DIR", type=Path)
+    parser.add_argument("--metric", default="value_mse")
+    parser.add_argument("--axes", nargs="+", default=(), metavar="KEY")
+    parser.add_argument("--out", metavar="FOLDER", type=Path)
     options = parser.parse_args(arguments)
     try:
         sweep = gather(find_jobs(options.folder), options.metric, options.axes)
     except RunError as error:
         parser.error(str(error))
     out = options.out or options.folder
-    out.mkdir(parents=True, exist_ok=True)
-    text = sweep_table(sweep)
-    (out / "sweep.md").write_text(text)
+    path, text = out / "sweep.md", sweep_table(sweep)
+    with replacing(path) as file:
+        file.write(text)
     [figure] = save_figures({"sweep": draw_sweep(sweep)}, out)
     print(text)
-    print(f"Written: {out / 'sweep.md'}, {figure}")
+    print(f"written  {path}\nfigure   {figure}")
