@@ -30,7 +30,7 @@ class HiddenLanding(ZermeloBoat):
     """A thin target whose level has no slope, so that neither sampling nor descent finds it."""
 
     def target_level(self, x):
-        return ((x - x.new_tensor(self.landing)).norm(dim=-1) > 1e-4) - 0.5
+        return ((x - x.new_tensor(self.landing)).norm(dim=-1) > 1e-4).to(x) - 0.5
 
 
 class OutOfReach(ZermeloBoat):
