@@ -72,6 +72,14 @@ def wilson_interval(successes: Array, trials: int, confidence: float = 0.95) -> 
     return lower(p), 1 - lower(1 - p)  # type: ignore[arg-type, return-value]
 
 
+def expected_deviation(mean: Tensor, rollouts: int) -> float:
+    """The mean |error| of Monte Carlo means (N,) of R rollouts, for normal errors: that of sqrt(2 p (1 - p) / (pi R)).
+
+    p (1 - p) is estimated without bias, so that R is at least 2.
+    """
+    return (2 * mean * (1 - mean) / (torch.pi * (rollouts - 1))).sqrt().mean().item()
+
+
 def monte_carlo(
     problem: ReachAvoidProblem,
     policy: Policy,

@@ -69,12 +69,14 @@ class Slice:
         monte_carlo: mean payoffs (k, k).
         field: the drift of the closed loop in the coordinates of the plane (k, k, 2), per s.
         action: controls (k, k, m), normalised to [-1, 1].
+        rollouts: the number of paths from each point.
     """
 
     section: Section
     monte_carlo: Tensor
     field: Tensor
     action: Tensor
+    rollouts: int
 
     @property
     def mae(self) -> float:
@@ -135,7 +137,7 @@ class Slices:
         shape = (self.points, self.points)
         field = projected_field(solution, section).cpu().reshape(*shape, 2)
         action = solution.problem.controls.normalize(solution.policy(section.tau, section.x))
-        return Slice(section, mean.cpu().reshape(shape), field, action.cpu().reshape(*shape, -1))
+        return Slice(section, mean.cpu().reshape(shape), field, action.cpu().reshape(*shape, -1), self.rollouts)
 
 
 def projected_field(solution: Solution, section: Section) -> Tensor:

@@ -10,10 +10,10 @@ from torch import Tensor
 from pirl_rl.arguments import Policy
 from pirl_rl.ascent import look_ahead_policy
 from pirl_rl.errors import ArgumentError
-from pirl_rl.evaluation.inputs import noise_rng, points_rng
+from pirl_rl.evaluation.inputs import like, noise_rng, points_rng
 from pirl_rl.evaluation.judgement import Difference, Measures, describe, judge, verdict_of
 from pirl_rl.evaluation.largest_residual import largest_residual
-from pirl_rl.evaluation.monte_carlo import mean_payoff, wilson_interval
+from pirl_rl.evaluation.monte_carlo import expected_deviation, mean_payoff, wilson_interval
 from pirl_rl.evaluation.other_policies import play_open_loop
 from pirl_rl.grid import GridSolution
 from pirl_rl.problem import ReachAvoidProblem
@@ -112,9 +112,10 @@ class Verdict:
 
     def __call__(self, solution: Solution, simulator: Simulator) -> VerdictEvidence:
         problem, rng = solution.problem, points_rng(self.seed)
-        _, x = self.initial_states.sample(problem, self.points, 1, rng, solution.dtype)
-        fraction = 1 - torch.rand(self.points, generator=rng, dtype=solution.dtype)
-        tau, x = problem.horizon * fraction.to(solution.device), x.to(solution.device)
+        # In double precision, so that solutions of any precision are judged at the same states.
+        _, x = self.initial_states.sample(problem, self.points, 1, rng, torch.float64)
+        fraction = 1 - torch.rand(self.points, generator=rng, dtype=torch.float64)
+        tau, x = like(solution, problem.horizon * fraction, x)
         few = slice(0, max(8, self.points // SHARE))
 
         def play(policy: Policy, rollouts: int, where: slice = slice(None), refinement: int = 1):
@@ -146,9 +147,9 @@ class Verdict:
                 ahead=ahead,
                 finer=_difference(finely, learned[few]),
                 gap=(value - learned).abs().mean().item(),
-                noise=_expected_deviation(learned, self.rollouts),
+                noise=expected_deviation(learned, self.rollouts),
                 gap_finer=(value[few] - finely).abs().mean().item(),
-                noise_finer=_expected_deviation(finely, max(2, self.rollouts // 2)),
+                noise_finer=expected_deviation(finely, max(2, self.rollouts // 2)),
                 bias=_difference(value, learned),
                 value_spread=value.std().item(),
                 success_spread=learned.std().item(),
@@ -164,8 +165,3 @@ def _difference(other: Tensor, learned: Tensor) -> Difference:
     """The mean of `other` minus `learned`, success (N,) at the same independent states, and its standard error."""
     gap = other - learned
     return Difference(gap.mean().item(), (gap.std() / len(gap) ** 0.5).item())
-
-
-def _expected_deviation(mean: Tensor, rollouts: int) -> float:
-    """The mean absolute deviation of Monte Carlo means (N,), for normal errors: sqrt(2 p (1 - p) / (pi R))."""
-    return (2 * mean * (1 - mean) / (torch.pi * (rollouts - 1))).sqrt().mean().item()

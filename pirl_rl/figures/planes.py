@@ -17,10 +17,10 @@ TARGET, AVOID = "limegreen", "red"
 
 
 def draw_plane(axes: Axes, section: Section, values: Tensor) -> QuadMesh:
-    """Draw a heat map and contours of values (k, k) in [0, 1] on a section's grid; returns the heat map."""
+    """Draw a heat map of values (k, k) in [0, 1] on a section's grid, with contours of V; returns the heat map."""
     first, second = (axis.numpy() for axis in section.axes)
     mesh = axes.pcolormesh(first, second, values.numpy(), cmap="viridis", vmin=0, vmax=1, shading="nearest")
-    lines = axes.contour(first, second, values.numpy(), CONTOURS, colors="white", linewidths=1)
+    lines = axes.contour(first, second, section.value.numpy(), CONTOURS, colors="white", linewidths=1)
     axes.clabel(lines, fontsize="x-small")
     draw_sets(axes, section)
     axes.set(xlabel=section.plane.axes[0], ylabel=section.plane.axes[1])

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from pirl_rl.evaluation.monte_carlo import expected_deviation
 from pirl_rl.evaluation.slices import Section, Slice, SlicesEvidence
 from pirl_rl.figures.evidence import draw
 from pirl_rl.figures.planes import draw_plane, draw_sets
@@ -27,9 +28,12 @@ def draw_slices(evidence: SlicesEvidence) -> dict[str, Figure]:
 
 
 def draw_slice(cut: Slice) -> Figure:
-    """The learned V with the directions of the closed loop, beside Monte Carlo."""
+    """The learned V with the directions of the closed loop, beside Monte Carlo with the contours of V."""
     section = cut.section
-    titles = (f"Learned V, τ = {section.tau[0]:g} s", f"Monte Carlo of the policy, mean |difference| {cut.mae:.3f}")
+    gap = f"mean |difference| {cut.mae:.3f}"
+    if cut.rollouts > 1:
+        gap += f", of which noise {expected_deviation(cut.monte_carlo, cut.rollouts):.3f}"
+    titles = (f"Learned V, τ = {section.tau[0]:g} s", f"Monte Carlo of the policy, with lines of V;\n{gap}")
     figure = Figure(figsize=(10.4, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     for axes, title, values in zip((left, right), titles, (section.value, cut.monte_carlo), strict=True):
