@@ -14,7 +14,11 @@ MODEL = ROOT / "models" / "drift"
 
 # Written over the cell tagged "parameters".
 SHORT = {
-    "01_quickstart": "UPDATES, OWN_UPDATES, COMPILE = 2_000, 200, False",
+    "01_quickstart": "UPDATES, OWN_UPDATES, COMPILE = 1_500, 100, False\n"
+    "MORE = {'env.dt': 0.02, 'env.substeps': 2, 'evaluate_every': 2_000, 'env.num_envs': 1_024, "
+    "'collector.frames_per_batch': 51_200, 'collector.warmup_frames': 51_200, 'evaluation.success.episodes': 1_000, "
+    "'evaluation.calibration.rollouts': 32, 'evaluation.slices.rollouts': 2, 'evaluation.verdict.points': 40, "
+    "'evaluation.verdict.rollouts': 8}",
     "02_drift": f"MODEL = {str(MODEL)!r}\nROLLOUTS = 200",
     "03_schedules": "UPDATES, ROUNDS, CANDIDATES = 100, 1, 1\n"
     "SETTINGS = '+experiment=reach1d compile=false pirl.final=[1,1,10] env.num_envs=256 "
@@ -43,7 +47,7 @@ def printed(cell: nbformat.NotebookNode) -> str:
 def test_notebook_executes(path, tmp_path, monkeypatch):
     """The last line printed says how far the value of the last cell's run is from Monte Carlo of its own policy.
 
-    Quick start: two thousand updates, enough to turn the warm-up's random play out of the buffer, leave errors of V
+    Quick start: 1,500 updates, enough to turn the warm-up's random play out of the buffer, leave errors of V
     below 0.1 and 4,000 rollouts standard errors below 0.008, so 0.15 leaves room for rounding to steer training
     elsewhere; an untrained critic, near 0.5 everywhere, is off by more than 0.3. The problem of one's own, whose value
     does not enter, has far fewer updates.

@@ -78,7 +78,7 @@ def test_a_section_shows_both_sets_and_the_policy():
     problem = Plain()
     simulator = Simulator(problem, 0.1)
     evidence = Slices(points=5, rollouts=2)(Known(problem), simulator)
-    assert {*evidence.metrics()} == {*meanings_of({"slices": Slices(points=5, rollouts=2)}, problem)}
+    assert {*evidence.metrics()} == {*meanings_of({"slices": Slices(points=5, rollouts=2)}, problem)["slices"]}
     cut = evidence.slices["steepest"]
     assert cut.action.shape == (5, 5, 6)
     assert torch.allclose(cut.action[0, 0], torch.tensor(problem.normal).sign())

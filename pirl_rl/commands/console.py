@@ -34,7 +34,11 @@ def quiet_libraries() -> None:
     warnings.filterwarnings("ignore", category=FutureWarning, module=r"(torch|tensordict|torchrl)\b")
 
 
-def outcome(lines: Sequence[str], summary: Mapping[str, float], meanings: Mapping[str, str], verbose: bool) -> str:
+Meanings = Mapping[str, Mapping[str, str]]
+"""What metrics mean, by the group of the table to which they belong and by metric."""
+
+
+def outcome(lines: Sequence[str], summary: Mapping[str, float], meanings: Meanings, verbose: bool) -> str:
     """What a command prints at its end: the verdict, and the table of all metrics if it is asked for.
 
     Without a verdict the table is printed in any case.
@@ -46,13 +50,18 @@ def outcome(lines: Sequence[str], summary: Mapping[str, float], meanings: Mappin
     return "\n".join(["", *lines, "metrics   verbose=true prints all of them with their meaning", ""])
 
 
-def metrics_table(summary: Mapping[str, float], meanings: Mapping[str, str]) -> str:
-    """A table of the entries of a summary, with the meanings of the metrics among them."""
+def metrics_table(summary: Mapping[str, float], meanings: Meanings) -> str:
+    """A table of the entries of a summary: those without a meaning, and then a group for each evaluator."""
+    known = {name for group in meanings.values() for name in group}
+    groups = {"run": dict.fromkeys(name for name in summary if name not in known), **meanings}
     rows = []
-    for name, value in summary.items():
-        first, *others = textwrap.wrap(meanings.get(name, ""), 84) or [""]
-        rows += [f"{name:<20} {value:>12.5g}   {first}".rstrip(), *(f"{'':<36}{line}" for line in others)]
-    return "\n".join(["", f"{'metric':<20} {'value':>12}   meaning", "-" * 120, *rows, ""])
+    for group, texts in groups.items():
+        if any(name in summary for name in texts):
+            rows += ["", group]
+        for name in (name for name in texts if name in summary):
+            first, *others = textwrap.wrap(texts[name] or "", 82) or [""]
+            rows += [f"  {name:<20} {summary[name]:>12.5g}   {first}".rstrip(), *(f"{'':<38}{line}" for line in others)]
+    return "\n".join([*rows, ""])
 
 
 def named_modules(overrides: Sequence[str]) -> list[str]:

@@ -74,7 +74,7 @@ def solve(
     summary |= metrics_of(evidence)
     with replacing(run.summary) as file:
         file.write(json.dumps(statements_of(evidence) | summary, indent=2) + "\n")
-    meanings = MEANINGS | meanings_of(evaluators, problem)
+    meanings = {"grid": MEANINGS} | meanings_of(evaluators, problem)
     print(outcome(lines_of(evidence), summary, meanings, config.verbose))
     for figure in draw_run(solution, run.metrics, run.figures, evidence):
         print(f"figure   {figure}")

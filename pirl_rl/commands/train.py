@@ -119,7 +119,8 @@ def resume(folder: Path, overrides: Sequence[str]) -> None:
             if text.startswith("start="):
                 raise ConfigError(f"{text}: the run has begun already; start= is for new runs, without resume=")
             before, after = override(config, text)
-            print(f"resume: {text.partition('=')[0]} was {before}, and is {after} from now on", flush=True)
+            if before != after:
+                print(f"resume: {text.partition('=')[0]} was {before}, and is {after} from now on", flush=True)
         if config.get("grid") is not None:
             raise ConfigError(f"resume: expected a run that was trained, but {folder} holds the solution of a grid")
         trainer = make_trainer(config, folder, [*config.trust, *named_modules(overrides)])

@@ -60,9 +60,9 @@ def metrics_of(evidence: Mapping[str, Evidence]) -> dict[str, float]:
     return {name: value for entry in evidence.values() for name, value in entry.metrics().items()}
 
 
-def meanings_of(evaluators: Mapping[str, Evaluator], problem: ReachAvoidProblem) -> dict[str, str]:
-    """The meanings of all metrics that the evaluators have for a problem, by metric."""
-    return {name: text for evaluator in evaluators.values() for name, text in evaluator.meanings(problem).items()}
+def meanings_of(evaluators: Mapping[str, Evaluator], problem: ReachAvoidProblem) -> dict[str, dict[str, str]]:
+    """The meanings of all metrics that the evaluators have for a problem, by evaluator and metric."""
+    return {name: evaluator.meanings(problem) for name, evaluator in evaluators.items()}
 
 
 @runtime_checkable
