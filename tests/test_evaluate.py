@@ -8,6 +8,7 @@ import pytest
 from small import small_trainer
 
 from pirl_rl import evaluate
+from pirl_rl.run_directory import RunDirectory
 
 FIGURES = {"training.png", "surface.png", "value.png", "policy.png"}
 
@@ -37,6 +38,16 @@ def test_takes_other_samples(run):
     width, before = (entry["success_high"] - entry["success_low"] for entry in (results, summary))
     assert "value_mse" not in results
     assert width < before / 2  # 2,000 episodes against the debug configuration's 64
+
+
+def test_a_run_of_an_earlier_version_has_no_verbose(run, capsys):
+    folder = run[0]
+    config = RunDirectory(folder).config
+    config.write_text("".join(line for line in config.read_text().splitlines(True) if not line.startswith("verbose")))
+    few = [f"run={folder}", "evaluation.final=[success]", "evaluation.success.episodes=50"]
+    evaluate.main(few)
+    evaluate.main([*few, "verbose=true"])
+    assert "success_rate" in capsys.readouterr().out
 
 
 def test_draws_nowhere_else(run, tmp_path, capsys):

@@ -108,7 +108,7 @@ def drop_leftovers(config: DictConfig, typed: Sequence[str], trust: Sequence[str
 
 
 def check_overrides(texts: Sequence[str]) -> None:
-    """Refuse overrides that cannot be read, and unknown choices of a group of `conf/`, which Hydra reports in 26 lines.
+    """Refuse overrides that cannot be read, and unknown choices of a group of `conf/`, in one sentence.
 
     Args:
         texts: overrides `key=value`; flags of Hydra among them are skipped.

@@ -22,6 +22,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from omegaconf import open_dict
+
 from pirl_rl.assembly import make_evaluation_simulator, make_evaluators
 from pirl_rl.commands.console import named_modules, outcome, override, reported
 from pirl_rl.configuration import load_config
@@ -47,7 +49,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         overrides = [item for item in arguments if item not in named]
         config = load_config(folder)
         config.trust = []
-        config.setdefault("verbose", False)  # older runs have no such setting
+        with open_dict(config):
+            config.setdefault("verbose", False)  # older runs have no such setting
         for text in overrides:
             override(config, text)
         trust = [*config.trust, *named_modules(overrides)]
