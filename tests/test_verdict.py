@@ -131,6 +131,7 @@ GOOD = Measures(
     still=[],
     gain=0.1,
     gain_at=[0.0],
+    states=6,
 )
 
 
@@ -168,6 +169,14 @@ def test_controls_that_never_move_are_named_and_eight_lines_suffice():
     assert len(lines) == 8
     assert "control   components 0, 2 of the control never move" in lines
     assert "[0, 0, 0, 0, 0, 0, ...]" in "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    ("changes", "advised"), [({"states": 2}, True), ({"states": 3}, False), ({"states": 2, "ahead": None}, False)]
+)
+def test_the_grid_is_advised_for_few_states(changes, advised):
+    measures = dataclasses.replace(GOOD, gap=0.05, **changes)
+    assert ("method=grid" in describe(measures, judge(measures))[-1]) == advised
 
 
 def test_open_loop_controls_agree_with_their_closed_form():

@@ -29,6 +29,10 @@ FLAT, VARIED = 0.01, 0.05
 """Standard deviations over the states: below the first V is constant, above the second success varies."""
 
 
+GRID_STATES = 2
+"""The largest number of states for which the grid is advised."""
+
+
 class Difference(NamedTuple):
     """A mean difference of success at the same states, and its standard error."""
 
@@ -68,6 +72,7 @@ class Measures:
         still: numbers of the controls that never move.
         gain: the largest gain of V per s that the HJB residual promises for another control, over the states.
         gain_at: the state of `gain`.
+        states: the number n of states of the problem.
         invariance: whether the problem asks to stay out of the avoid set.
     """
 
@@ -90,6 +95,7 @@ class Measures:
     still: list[int]
     gain: float
     gain_at: list[float]
+    states: int
     invariance: bool = False
 
     @property
@@ -182,7 +188,10 @@ def describe(m: Measures, reasons: list[Reason]) -> list[str]:
         names = f"component {m.still[0]}" if len(m.still) == 1 else f"components {', '.join(map(str, m.still))}"
         lines.append(f"control   {names} of the control never move{'s' if len(m.still) == 1 else ''}")
     if reasons:
-        lines.append(f"next      {'; '.join(dict.fromkeys(reason.advice for reason in reasons))}")
+        advice = dict.fromkeys(reason.advice for reason in reasons)
+        if m.states <= GRID_STATES and m.ahead is not None:  # which is not played with the policy of a grid
+            advice["or solve it on a grid, which takes seconds (method=grid)"] = None
+        lines.append(f"next      {'; '.join(advice)}")
     return lines
 
 

@@ -156,6 +156,7 @@ class Verdict:
                 still=(u.std(0) < STILL).nonzero().flatten().tolist(),
                 gain=gain,
                 gain_at=x[worst].tolist(),
+                states=problem.states.dim,
                 invariance=problem.objective == "invariance",
             )
         )
