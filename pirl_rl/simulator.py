@@ -204,14 +204,32 @@ class Simulator:
     @staticmethod
     def _crossed(constraints, x, moved, sigma, h, uniform) -> tuple[Tensor, Tensor]:
         """Whether the bridge crossed each face, and whether all other constraints hold at both ends; (N, k) bool."""
-        before, after = constraints(x), constraints(moved)
-        variance = _squared_noise(constraints, x, sigma, before.shape[-1]) * h[..., None]
-        exponent = -2 * before * after / variance
-        # Where the variance is 0, the exponent is NaN or infinite, and the face is not crossed between the ends.
-        probability = torch.where((variance > 0) & (before > 0) & (after > 0), exponent.exp(), torch.zeros_like(before))
+        probability, before, after = crossing_probability(constraints, x, moved, sigma, h)
         held = (before <= 0) & (after <= 0)
         others_hold = held.sum(-1, keepdim=True) - held.long() == before.shape[-1] - 1
         return uniform < probability, others_hold
+
+
+def crossing_probability(
+    constraints: Callable[[Tensor], Tensor], x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The probability (N, k) that a Brownian bridge crosses each of k faces, Eq. (bridge), and the levels (N, k).
+
+    Args:
+        constraints: the levels of the faces.
+        x, moved: both ends of the bridge (N, n). Where one of them lies inside a face, the probability is 0.
+        sigma: (N, n, w) at x.
+        h: the time between the ends (N,), in s.
+
+    Returns:
+        The probability, and the levels at x and at `moved`.
+    """
+    before, after = constraints(x), constraints(moved)
+    variance = _squared_noise(constraints, x, sigma, before.shape[-1]) * h[..., None]
+    exponent = -2 * before * after / variance
+    # Where the variance is 0, the exponent is NaN or infinite, and the face is not crossed between the ends.
+    probability = torch.where((variance > 0) & (before > 0) & (after > 0), exponent.exp(), torch.zeros_like(before))
+    return probability, before, after
 
 
 def _squared_noise(constraints: Callable[[Tensor], Tensor], x: Tensor, sigma: Tensor, count: int) -> Tensor:

@@ -71,12 +71,15 @@ class Chain:
         mesh: the nodes.
         free: numbers (M,) of the nodes outside A and B.
         controls: candidate controls (K, M, m), in SI units.
+        moves: whether the chains have the drift of the SDE. Without it they have the noise alone.
 
     Attributes:
         axes: forward and backward arms along each axis.
     """
 
-    def __init__(self, problem: ReachAvoidProblem, mesh: Mesh, free: np.ndarray, controls: np.ndarray):
+    def __init__(
+        self, problem: ReachAvoidProblem, mesh: Mesh, free: np.ndarray, controls: np.ndarray, moves: bool = True
+    ):
         self._problem, self._mesh = problem, mesh
         self._at = mesh.indices()[free]
         self._unknown = np.full(mesh.size, -1)
@@ -86,7 +89,7 @@ class Chain:
         noise, blocks, gains = None, [], []
         for u in controls:
             control = torch.from_numpy(np.ascontiguousarray(u))
-            drift = problem.drift(x, control).numpy() / mesh.spacing
+            drift = problem.drift(x, control).numpy() * (moves / mesh.spacing)
             if noise is None or has_controlled_noise(problem):
                 noise = self._noise(problem.diffusion(x, control).numpy())
             rates, gain = self._assembled(drift, noise)

@@ -14,9 +14,14 @@ from pirl_rl.errors import ArgumentError, CheckpointError
 from pirl_rl.files import replacing
 from pirl_rl.grid.mesh import Mesh, absorbed
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.simulator import crossing_probability
 
 ROUNDING = 1e-4
 """The share of the horizon by which tau may exceed it, because tau may be rounded to float32."""
+
+
+POINTS_OF_A_CELL = 8
+"""The number of points of a path through one cell, between which the noise may cross a face."""
 
 
 class GridSolution:
@@ -34,6 +39,9 @@ class GridSolution:
         controls: candidate controls (K, M, m), in SI units.
         nearest: for every node (N,) the place, among the M nodes, of the nearest node outside A and B.
         coarse: the solution with half as many points and steps, or None, and then the error is not known.
+        split: whether drift and noise acted in turns, see `pirl_rl.grid.transport`. V is then not extrapolated from
+            `coarse`, since its order is not known. In cells that a face cuts it is that at the end of a short path, see
+            `_after_a_cell`: where the noise is weak, V rises from the face within a layer that is thinner than a cell.
     """
 
     def __init__(
@@ -45,8 +53,9 @@ class GridSolution:
         controls: np.ndarray,
         nearest: np.ndarray,
         coarse: GridSolution | None = None,
+        split: bool = False,
     ):
-        self.problem, self.mesh, self.coarse = problem, mesh, coarse
+        self.problem, self.mesh, self.coarse, self.split = problem, mesh, coarse, split
         self._values, self._policy, self._controls, self._nearest = values, policy, controls, nearest
 
     dtype, device = torch.float64, torch.device("cpu")
@@ -94,6 +103,7 @@ class GridSolution:
             "policy": self._policy,
             "controls": self._controls,
             "nearest": self._nearest,
+            "split": np.array(self.split),
         }
         coarse = {} if self.coarse is None else self.coarse._arrays()
         return arrays | {f"coarse_{name}": array for name, array in coarse.items()}
@@ -105,7 +115,8 @@ class GridSolution:
             arrays[prefix + name] for name in ("values", "policy", "controls", "nearest")
         )
         mesh = Mesh(low, spacing, shape.tolist(), periodic.tolist())
-        return cls(problem, mesh, values, policy, controls, nearest)
+        split = bool(arrays.get(f"{prefix}split", False))  # files of earlier versions lack it
+        return cls(problem, mesh, values, policy, controls, nearest, split=split)
 
     def raw_value(self, tau: Tensor, x: Tensor) -> Tensor:
         """V (P,) as `value` gives it; a grid has no other."""
@@ -189,6 +200,10 @@ class GridSolution:
     def _between(self, tau: Tensor, x: Tensor) -> Tensor:
         """V (P,) between the nodes, extrapolated where no face is near, and continued into A and B."""
         fine = self._interpolated(tau, x)
+        if self.split:
+            cut = ~self._uncut(x) & self.problem.interior(x)
+            fine[cut] = self._after_a_cell(tau[cut], x[cut])
+            return fine
         if self.coarse is None:
             return fine
         return torch.where(self.coarse._uncut(x), 2 * fine - self.coarse._interpolated(tau, x), fine)
@@ -199,6 +214,32 @@ class GridSolution:
         for time, node, weight in self._corners(tau, x):
             result += weight * self._values[time, node]
         return torch.from_numpy(result).to(x)
+
+    def _after_a_cell(self, tau: Tensor, x: Tensor) -> Tensor:
+        """V (P,) at states outside A and B, from that where the flow is one cell further.
+
+        On the way the noise may cross a face, with the probability of Eq. (bridge) between any two of the points
+        through which the flow goes.
+        """
+        problem, sets = self.problem, []
+        if problem.objective == "reach-avoid":
+            sets.append((problem.reached_constraints, True))
+        if problem.has_avoid_set:
+            sets.append((problem.avoid_constraints, False))
+        rate = problem.drift(x, self.policy(tau, x)).abs() / torch.as_tensor(self.mesh.spacing).to(x)
+        h = torch.minimum(tau, 1 / rate.amax(-1).clamp(min=1e-12)) / POINTS_OF_A_CELL
+        under_way, value = torch.ones_like(tau), torch.zeros_like(tau)
+        for _ in range(POINTS_OF_A_CELL):
+            u = self.policy(tau, x)
+            moved, sigma = problem.states.wrap(x + problem.drift(x, u) * h.unsqueeze(-1)), problem.diffusion(x, u)
+            for constraints, reached in sets:
+                crossed, before, after = crossing_probability(constraints, x, moved, sigma, h)
+                crossed = torch.where((before <= 0) | (after <= 0), torch.ones_like(crossed), crossed)
+                # All constraints of A must hold, and one of B suffices.
+                ended = under_way * (crossed.amin(-1) if reached else 1 - (1 - crossed).prod(-1))
+                under_way, value = under_way - ended, value + (ended if reached else 0)
+            tau, x = (tau - h).clamp(min=0), moved
+        return value + under_way * self._interpolated(tau, x)
 
     def _uncut(self, x: Tensor) -> Tensor:
         """Whether all corners of the cells around states (P, n) lie outside A and B, (P,) bool."""

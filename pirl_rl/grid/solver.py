@@ -20,6 +20,7 @@ from pirl_rl.grid.candidates import candidates
 from pirl_rl.grid.chain import Chain
 from pirl_rl.grid.mesh import Mesh, absorbed, default_margin, make_mesh
 from pirl_rl.grid.solution import GridSolution
+from pirl_rl.grid.transport import Transport, has_weak_noise
 from pirl_rl.problem import ReachAvoidProblem
 
 POINTS = {1: 401, 2: 121, 3: 51}
@@ -95,24 +96,40 @@ class GridSolver:
         inside, fixed = absorbed(problem, nodes)
         free = np.flatnonzero(~inside)
         controls = candidates(problem, nodes[free], mesh.spacing, self.levels)
-        chain = Chain(problem, mesh, free, controls)
+        # Two states have meshes that are fine enough for the chain, which is monotone.
+        split = len(points) > 2 and has_weak_noise(problem, mesh, nodes[free], controls)
+        chain = Chain(problem, mesh, free, controls[:1] if split else controls, moves=not split)
         value = problem.boundary_value(torch.from_numpy(nodes[free])).numpy()
         if not (value.any() or any(arm.value.any() for pair in chain.axes for arm in pair)):
             raise ArgumentError(f"points: expected a mesh that meets the target, got none of its nodes with {points}")
         continued = _Continuation(mesh, free, fixed, chain)
         values = np.empty((steps + 1, mesh.size), np.float32)
         policies = np.empty((steps + 1, len(free)), np.min_scalar_type(len(controls)))
-        times = problem.horizon * np.linspace(0, 1, steps + 1) ** 2
-        values[0], policy = continued(value), np.zeros(len(free), int)
-        for step, dt in enumerate(np.diff(times), start=1):
-            value, policy = _advance(chain, value, policy, dt)
-            values[step], policies[step] = continued(value), policy
+        shares = np.linspace(0, 1, steps + 1) ** 2
+        values[0] = continued(value)
+        if split:
+            # Equal steps have the same paths; V is noted at the times of all solutions.
+            dt = problem.horizon / steps
+            transport = Transport(problem, mesh, nodes[free], controls, dt)
+            after = values[0]
+            for step in range(steps):
+                before, (moved, policy) = after, transport(after)
+                value = _solve(chain, moved, moved, np.zeros_like(policy), dt)
+                after, within = continued(value), steps * shares - step
+                for level in np.flatnonzero((within > 0) & (within <= 1)):
+                    values[level] = (1 - within[level]) * before + within[level] * after
+                    policies[level] = policy
+        else:
+            policy = np.zeros(len(free), int)
+            for step, dt in enumerate(problem.horizon * np.diff(shares), start=1):
+                value, policy = _advance(chain, value, policy, dt)
+                values[step], policies[step] = continued(value), policy
         policies[0] = policies[1]
         place = np.full(mesh.size, -1)
         place[free] = np.arange(len(free))
         around = distance_transform_edt(inside.reshape(mesh.shape), return_distances=False, return_indices=True)
         nearest = place[mesh.flat(np.moveaxis(np.asarray(around), 0, -1)).ravel()]
-        return GridSolution(problem, mesh, values, policies, controls, nearest)
+        return GridSolution(problem, mesh, values, policies, controls, nearest, split=split)
 
 
 def _advance(chain: Chain, before: np.ndarray, policy: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
