@@ -124,6 +124,6 @@ def test_a_missing_key_is_told_at_the_start(monkeypatch):
     monkeypatch.delenv("OPENAI_API_KEY", raising=False)
     node = OmegaConf.merge(OmegaConf.load(CONF / "advisor" / "openai.yaml"), GIVEN["openai"])
     with pytest.raises(
-        ConfigError, match="advisor: key_variable: expected the key in the environment, but OPENAI_API_KEY"
+        ConfigError, match=r"advisor\.key_variable: expected the key in the environment, but OPENAI_API_KEY"
     ):
         build(node, "advisor")
