@@ -20,7 +20,7 @@ from pirl_rl.grid.candidates import candidates
 from pirl_rl.grid.chain import Chain
 from pirl_rl.grid.mesh import Mesh, absorbed, default_margin, make_mesh
 from pirl_rl.grid.solution import GridSolution
-from pirl_rl.grid.transport import Transport, has_weak_noise
+from pirl_rl.grid.transport import Transport, can_split
 from pirl_rl.problem import ReachAvoidProblem
 
 POINTS = {1: 401, 2: 121, 3: 51}
@@ -97,7 +97,8 @@ class GridSolver:
         free = np.flatnonzero(~inside)
         controls = candidates(problem, nodes[free], mesh.spacing, self.levels)
         # Two states have meshes that are fine enough for the chain, which is monotone.
-        split = len(points) > 2 and has_weak_noise(problem, mesh, nodes[free], controls)
+        dt = problem.horizon / steps
+        split = len(points) > 2 and can_split(problem, mesh, nodes[free], controls, dt)
         chain = Chain(problem, mesh, free, controls[:1] if split else controls, moves=not split)
         value = problem.boundary_value(torch.from_numpy(nodes[free])).numpy()
         if not (value.any() or any(arm.value.any() for pair in chain.axes for arm in pair)):
@@ -109,7 +110,6 @@ class GridSolver:
         values[0] = continued(value)
         if split:
             # Equal steps have the same paths; V is noted at the times of all solutions.
-            dt = problem.horizon / steps
             transport = Transport(problem, mesh, nodes[free], controls, dt)
             after = values[0]
             for step in range(steps):
@@ -121,8 +121,8 @@ class GridSolver:
                     policies[level] = policy
         else:
             policy = np.zeros(len(free), int)
-            for step, dt in enumerate(problem.horizon * np.diff(shares), start=1):
-                value, policy = _advance(chain, value, policy, dt)
+            for step, share in enumerate(np.diff(shares), start=1):
+                value, policy = _advance(chain, value, policy, problem.horizon * share)
                 values[step], policies[step] = continued(value), policy
         policies[0] = policies[1]
         place = np.full(mesh.size, -1)

@@ -26,6 +26,9 @@ from pirl_rl.problem import ReachAvoidProblem, has_controlled_noise
 WEAK = 2.0
 """h |f| / sigma^2 along an axis, from which the noise is weak beside the mesh: there the chain is upwind."""
 
+FARTHEST = 2.0
+"""The largest number of cells through which a path goes while its control is held."""
+
 PADDING = 8
 """Nodes by which periodic axes are continued at both ends, where a cubic spline forgets its ends."""
 
@@ -36,17 +39,22 @@ GAIN = 1e-9
 """The gain of V by which a candidate must exceed those before it."""
 
 
-def has_weak_noise(problem: ReachAvoidProblem, mesh: Mesh, x: np.ndarray, controls: np.ndarray) -> bool:
-    """Whether the noise is weak beside the mesh at most of the nodes x (M, n), with controls (K, M, m).
+def can_split(problem: ReachAvoidProblem, mesh: Mesh, x: np.ndarray, controls: np.ndarray, dt: float) -> bool:
+    """Whether drift and noise should act in turns of dt, at nodes x (M, n) and with controls (K, M, m).
 
-    Noise that depends on the control cannot act in a part of its own, and never counts as weak.
+    The noise must be weak beside the mesh at most of the nodes, and no path may cross more than `FARTHEST` cells in a
+    turn, during which the control is held. Noise that depends on the control cannot act in a turn of its own.
     """
     if has_controlled_noise(problem):
         return False
     points, control = torch.from_numpy(x), torch.from_numpy(np.ascontiguousarray(controls[0]))
     variance = (problem.diffusion(points, control).numpy() / mesh.spacing[:, None]) ** 2
     drift = np.abs(problem.drift(points, control).numpy() / mesh.spacing)
-    return bool(((drift > WEAK * variance.sum(-1)).any(-1)).mean() > 0.5)
+    weak = ((drift > WEAK * variance.sum(-1)).any(-1)).mean() > 0.5
+    farthest = max(
+        np.abs(problem.drift(points, torch.from_numpy(u.copy())).numpy() / mesh.spacing).max() for u in controls
+    )
+    return bool(weak and farthest * dt <= FARTHEST)
 
 
 class Transport:
