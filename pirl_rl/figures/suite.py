@@ -44,7 +44,7 @@ def _draw_problems(panel: Axes, values: Mapping[str, Sequence[float]]) -> None:
     for row, runs in enumerate(values.values()):
         panel.plot(runs, [row] * len(runs), "o", color="C0", ms=4, alpha=0.6)
     panel.set_yticks(range(len(values)), list(values))
-    panel.invert_yaxis()
+    panel.set_ylim(len(values) - 0.5, -0.5)  # the same in all panels, also where a problem has no truth
     panel.grid(alpha=0.3)
 
 
@@ -57,7 +57,10 @@ def _draw_times(panel: Axes, scores: Mapping[str, Sequence[Mapping[str, float]]]
     for family, times in families.items():
         panel.plot(sorted(times), [times[n] for n in sorted(times)], "o-", label=family)
     if families:
+        numbers = sorted({n for times in families.values() for n in times})
         panel.set_xscale("log")
+        panel.set_xticks(numbers, list(map(str, numbers)))
+        panel.minorticks_off()
         panel.set_ylim(bottom=0)
         panel.legend()
     panel.set(xlabel="number of states n", ylabel="time of training (s)")
