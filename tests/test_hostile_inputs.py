@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -257,7 +258,7 @@ def workplace(trained, tmp_path, monkeypatch) -> Path:
     (tmp_path / "own.py").write_text(OWN)
     (tmp_path / "broken.py").write_text("def f(:\n")
     for module in ("own", "broken"):
-        monkeypatch.delitem(__import__("sys").modules, module, raising=False)
+        monkeypatch.delitem(sys.modules, module, raising=False)
     return tmp_path
 
 

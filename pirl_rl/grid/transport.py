@@ -69,7 +69,7 @@ class Transport:
     """
 
     def __init__(self, problem: ReachAvoidProblem, mesh: Mesh, x: np.ndarray, controls: np.ndarray, dt: float):
-        self._problem, self._mesh = problem, mesh
+        self._mesh = mesh
         points = torch.from_numpy(x)
         self._feet = [_foot(problem, mesh, points, torch.from_numpy(np.ascontiguousarray(u)), dt) for u in controls]
 
