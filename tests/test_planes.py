@@ -84,7 +84,7 @@ def test_a_section_shows_both_sets_and_the_policy():
     assert torch.allclose(cut.action[0, 0], torch.tensor(problem.normal).sign())
     assert not cut.section.failed.any()
     # Along the normal the target fills the part of the plane where a . x >= 1.
-    fine = Section.of(Known(problem), cut.section.plane, 151)  # type: ignore[arg-type]
+    fine = Section.of(Known(problem), cut.section.plane, 151, cut.section.time)  # type: ignore[arg-type]
     assert torch.equal(cut.section.reached.flatten(), problem.reached(fine.x.double()).flatten())
     figures = draw(evidence)
     assert {*figures} == {"slice_first", "slice_steepest", "policy_first", "policy_steepest"}

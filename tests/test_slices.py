@@ -65,7 +65,8 @@ def test_slice_of_the_exact_value():
     solution = Known(Walk())
     evidence = Slices(15, rollouts)(solution, Simulator(solution.problem, dt=0.1, substeps=1, crossing="bridge"))
     numbers = evidence.metrics()
-    assert set(numbers) == {"slice_walk_angle_mae", "slice_walk_angle_success"}
+    assert set(numbers) == {"slice_walk_angle_tau", "slice_walk_angle_mae", "slice_walk_angle_success"}
+    assert numbers["slice_walk_angle_tau"] == 2.0
     x = torch.linspace(-2, 2.5, 15, dtype=torch.float64)
     exact = Reach1D().exact_value(torch.full_like(x, 2.0), x.unsqueeze(-1))
     spread = (exact * (1 - exact)).sqrt()
@@ -78,6 +79,25 @@ def test_slice_of_the_exact_value():
     cut = evidence.slices["walk_angle"]
     assert torch.allclose(cut.section.value[4], exact)
     assert (cut.monte_carlo[:, x >= 2] == 1).all()
+
+
+@pytest.mark.parametrize(("speed", "time"), [(1.0, 2.0), (8.0, 0.25), (math.inf, 2.0)])
+def test_a_section_is_at_the_longest_time_to_go_at_which_v_varies(speed, time):
+    """V = 1 where the target, from x = 2, can be reached at a speed, and 0 elsewhere; at infinite speed V = 1."""
+
+    class Fast(Known):
+        def value(self, tau, x):
+            return (2 - x[..., 1] <= speed * tau).to(x.dtype)
+
+    solution = Fast(Walk())
+    plane = solution.problem.planes["walk_angle"]
+    section = Section.telling(solution, plane, 21)
+    assert section.time == time
+    if math.isfinite(speed):
+        assert 0 < section.value.mean() < 1
+    evidence = Rollouts(1, 21)(solution, Simulator(solution.problem, dt=0.1))
+    assert evidence.paths is not None
+    assert evidence.paths.tau[0].unique().item() == time
 
 
 def test_field_of_a_plane_in_other_coordinates():
@@ -98,7 +118,7 @@ def test_field_of_a_plane_in_other_coordinates():
             return {"polar": polar}
 
     solution = Known(Turning())
-    field = projected_field(solution, Section.of(solution, solution.problem.planes["polar"], 5))
+    field = projected_field(solution, Section.of(solution, solution.problem.planes["polar"], 5, 2.0))
     assert torch.allclose(field, torch.tensor([0.0, 1.0], dtype=torch.float64).expand(25, 2), atol=1e-6)
 
 
@@ -121,7 +141,7 @@ def test_field_at_the_drift_equilibrium_vanishes():
         around = Plane(
             plane.axes, Box([c - 0.1 for c in middle], [c + 0.1 for c in middle]), plane.embed, plane.project
         )
-        field = projected_field(solution, Section.of(solution, around, 3))
+        field = projected_field(solution, Section.of(solution, around, 3, problem.horizon))
         assert field[4].abs().max() < 1e-4
         assert field[0].abs().max() > 1e-2
 
@@ -175,7 +195,7 @@ def test_every_metric_of_the_drifting_problem_has_a_meaning():
     problem = VehicleDrift()
     meanings = Slices(31, 64).meanings(problem)
     assert list(problem.planes) == ["beta_r", "e_y_e_psi"]
-    assert set(meanings) == {f"slice_{plane}_{name}" for plane in problem.planes for name in ("mae", "success")}
+    assert set(meanings) == {f"slice_{plane}_{name}" for plane in problem.planes for name in ("tau", "mae", "success")}
     assert "31 x 31 grid of the plane beta_r" in meanings["slice_beta_r_mae"]
     assert Rollouts().meanings(problem) == Slices().meanings(Reach1D()) == {}
 

@@ -38,8 +38,9 @@ class RolloutsEvidence:
 
 
 class Rollouts:
-    """Plays paths over the whole horizon from those grid points of the first plane, outside A and B, where V is nearest
-    to 0.9, 0.5 and 0.1.
+    """Plays paths from those grid points of the first plane, outside A and B, where V is nearest to 0.9, 0.5 and 0.1.
+
+    The paths start at the time to go of `Section.telling`, which is the horizon wherever V varies on the plane then.
 
     Args:
         paths: number of paths from each start.
@@ -60,14 +61,15 @@ class Rollouts:
 
     def __call__(self, solution: Solution, simulator: Simulator) -> RolloutsEvidence:
         problem = solution.problem
-        sections = [Section.of(solution, plane, self.points) for plane in planes_of(solution).values()]
-        if not sections:
+        planes = list(planes_of(solution).values())
+        if not planes:
             return RolloutsEvidence([], None, [])
-        first = sections[0]
+        first = Section.telling(solution, planes[0], self.points)
+        others = [Section.of(solution, plane, self.points, first.time) for plane in planes[1:]]
         value = torch.where(problem.interior(first.x).cpu(), first.value.flatten(), torch.inf)
         starts = torch.stack([(value - level).abs().argmin() for level in START_VALUES])
         index = starts.repeat_interleave(self.paths).to(first.x.device)
         tau, x = first.tau[index], first.x[index]
         paths = closed_loop(simulator, solution.policy, tau, x, noise_rng(solution, self.seed))
         paths = Trajectories(*(entry.cpu() for entry in vars(paths).values()))
-        return RolloutsEvidence(sections, paths, value[starts].tolist())
+        return RolloutsEvidence([first, *others], paths, value[starts].tolist())

@@ -1,4 +1,4 @@
-"""V and Monte Carlo of the policy on two-dimensional sections of the state space, at the whole horizon."""
+"""V and Monte Carlo of the policy on two-dimensional sections of the state space, at one time to go."""
 
 from __future__ import annotations
 
@@ -19,15 +19,21 @@ from pirl_rl.solution import Solution
 OUTLINE = 151
 """The number of points along each axis of a plane on which the outlines of A and B are found."""
 
+SPREAD = 0.1
+"""A section shows little where the standard deviation of V over its points outside A and B is below this."""
+
+HALVINGS = 5
+"""The number of times that the time to go is halved in search of a section on which V varies."""
+
 
 @dataclass(frozen=True)
 class Section:
-    """V on the grid of k x k points of a plane, at tau = T.
+    """V on the grid of k x k points of a plane, at one time to go.
 
     Attributes:
         plane: the plane.
         axes: the coordinates (k,) of the grid along the first and along the second axis.
-        tau: times to go (k^2,) in s, all equal to the horizon.
+        tau: times to go (k^2,) in s, all equal.
         x: states (k^2, n) in SI units, row by row of the grid.
         value: V (k, k); entry [i, j] is at coordinate j of the first axis and i of the second.
         reached, failed: whether points lie in A and in B, bool, on a grid of `OUTLINE` points along each axis.
@@ -42,15 +48,40 @@ class Section:
     failed: Tensor
 
     @classmethod
-    def of(cls, solution: Solution, plane: Plane, points: int) -> Section:
-        """Compute V of a solution on a plane with `points` grid points along each axis."""
+    def of(cls, solution: Solution, plane: Plane, points: int, time: float) -> Section:
+        """V of a solution on a plane, with `points` grid points along each axis, at a time to go in s."""
         problem, axes, grid = solution.problem, *_grid(plane, points)
-        tau, x = like(solution, torch.full((len(grid),), problem.horizon), grid)
+        tau, x = like(solution, torch.full((len(grid),), time), grid)
         x = problem.states.wrap(x)
         value = solution.value(tau, x).cpu().reshape(points, points)
         fine = problem.states.wrap(_grid(plane, OUTLINE)[1])
         sets = [inside.reshape(OUTLINE, OUTLINE) for inside in (problem.reached(fine), problem.failed(fine))]
         return cls(plane, axes, tau, x, value, *sets)
+
+    @classmethod
+    def telling(cls, solution: Solution, plane: Plane, points: int) -> Section:
+        """The section at tau = T or, where V hardly varies on the plane then, at the largest T / 2^k at which it does.
+
+        A target that can be reached from everywhere in T has V = 1 all over the plane, which says nothing. If V varies
+        at none of these times, the section is that at tau = T.
+        """
+        horizon = solution.problem.horizon
+        times = [horizon / 2**k for k in range(HALVINGS + 1)]
+        sections = (cls.of(solution, plane, points, time) for time in times)
+        return next(
+            (section for section in sections if section.spread(solution.problem) >= SPREAD),
+            cls.of(solution, plane, points, horizon),
+        )
+
+    @property
+    def time(self) -> float:
+        """The time to go in s."""
+        return self.tau[0].item()
+
+    def spread(self, problem: ReachAvoidProblem) -> float:
+        """The standard deviation of V over the points outside A and B, or 0 where there are none."""
+        inside = problem.interior(self.x).cpu()
+        return self.value.flatten()[inside].std(correction=0).item() if bool(inside.any()) else 0.0
 
 
 def _grid(plane: Plane, points: int) -> tuple[tuple[Tensor, Tensor], Tensor]:
@@ -93,6 +124,7 @@ class SlicesEvidence:
     def metrics(self) -> dict[str, float]:
         metrics: dict[str, float] = {}
         for name, cut in self.slices.items():
+            metrics[f"slice_{name}_tau"] = cut.section.time
             metrics[f"slice_{name}_mae"] = cut.mae
             metrics[f"slice_{name}_success"] = cut.monte_carlo.mean().item()
         return metrics
@@ -118,10 +150,14 @@ class Slices:
     def meanings(self, problem: ReachAvoidProblem) -> dict[str, str]:
         meanings: dict[str, str] = {}
         for name in plane_names(problem):
+            meanings[f"slice_{name}_tau"] = (
+                f"The time to go of the slice {name} in s: the horizon or, where V hardly varies on the plane then, "
+                "the largest of its half, its quarter and so on at which it does."
+            )
             meanings[f"slice_{name}_mae"] = (
                 f"The mean of |V - Monte Carlo|, the latter the mean payoff of {self.rollouts:,} rollouts of the "
                 f"learned policy, on the {self.points} x {self.points} grid of the plane {name}, edges included, at "
-                "tau = T; V is 1 in A and 0 in B."
+                f"tau = slice_{name}_tau; V is 1 in A and 0 in B."
             )
             meanings[f"slice_{name}_success"] = f"The mean of the Monte Carlo in slice_{name}_mae."
         return meanings
@@ -131,7 +167,7 @@ class Slices:
         return SlicesEvidence({name: self._slice(solution, simulator, plane) for name, plane in planes.items()})
 
     def _slice(self, solution: Solution, simulator: Simulator, plane: Plane) -> Slice:
-        section = Section.of(solution, plane, self.points)
+        section = Section.telling(solution, plane, self.points)
         noise = noise_rng(solution, self.seed)
         mean = mean_payoff(simulator, solution.policy, section.tau, section.x, self.rollouts, noise)
         shape = (self.points, self.points)

@@ -22,7 +22,7 @@ OUTLINE = [withStroke(linewidth=1.8, foreground="black")]
 
 @draw.register
 def draw_rollouts(evidence: RolloutsEvidence) -> dict[str, Figure]:
-    """Paths projected onto every plane, with marked starts and ends, over the contours of V at tau = T."""
+    """Paths projected onto every plane, with marked starts and ends, over the contours of V at their time to go."""
     sections, paths, values = evidence.sections, evidence.paths, evidence.values
     if paths is None:
         return {}
@@ -30,11 +30,12 @@ def draw_rollouts(evidence: RolloutsEvidence) -> dict[str, Figure]:
     ended = zip(paths.reached.tolist(), paths.failed.tolist(), strict=True)
     ends = ["reached" if reached else "failed" if failed else "out of time" for reached, failed in ended]
     each = len(ends) // len(values)
-    all_axes = figure.subplots(1, len(sections), squeeze=False)[0]
+    all_axes, beyond = figure.subplots(1, len(sections), squeeze=False)[0], False
     for axes, section in zip(all_axes, sections, strict=True):
         mesh = draw_plane(axes, section, section.value)
         axes.set_facecolor(BEYOND)
         projected = section.plane.project(paths.state).numpy()
+        beyond = beyond or not bool(section.plane.box.contains(section.plane.project(paths.state)).all())
         for i, end in enumerate(ends):
             path = projected[: paths.steps[i] + 1, i]
             axes.plot(
@@ -46,7 +47,7 @@ def draw_rollouts(evidence: RolloutsEvidence) -> dict[str, Figure]:
     if paths.state.shape[-1] > 2:
         note = "Coordinates that a plane does not show change along a path; V is that on the plane."
         figure.suptitle(note, fontsize="small")
-    figure.colorbar(mesh, ax=list(all_axes), label=f"learned V, τ = {sections[0].tau[0]:g} s")
+    figure.colorbar(mesh, ax=list(all_axes), label=f"learned V, τ = {sections[0].time:g} s")
     starts = zip(STARTS, values, strict=True)
     handles: list[Artist] = [
         Line2D([], [], color=c, marker="D", mec="black", label=f"from V = {value:.2f}") for c, value in starts
@@ -55,7 +56,8 @@ def draw_rollouts(evidence: RolloutsEvidence) -> dict[str, Figure]:
         Line2D([], [], ls="", marker=marker, color=color, mec="black", label=f"{end}: {ends.count(end)}")
         for end, (marker, color) in ENDS.items()
     ]
-    handles.append(Patch(color=BEYOND, label="beyond the plane"))
+    if beyond:
+        handles.append(Patch(color=BEYOND, label="beyond the plane"))
     figure.legend(
         handles=handles,
         loc="outside lower center",

@@ -33,7 +33,7 @@ def draw_slice(cut: Slice) -> Figure:
     gap = f"mean |difference| {cut.mae:.3f}"
     if cut.rollouts > 1:
         gap += f", of which noise {expected_deviation(cut.monte_carlo, cut.rollouts):.3f}"
-    titles = (f"Learned V, τ = {section.tau[0]:g} s", f"Monte Carlo of the policy, with lines of V;\n{gap}")
+    titles = (f"Learned V, τ = {section.time:g} s", f"Monte Carlo of the policy, with lines of V;\n{gap}")
     figure = Figure(figsize=(10.4, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     for axes, title, values in zip((left, right), titles, (section.value, cut.monte_carlo), strict=True):
@@ -56,7 +56,7 @@ def draw_policy_slice(cut: Slice) -> Figure:
         mesh = axes.pcolormesh(first, second, action, cmap="coolwarm", vmin=-1, vmax=1, shading="nearest")
         draw_sets(axes, section)
         name = "u" if cut.action.shape[-1] == 1 else f"u_{{{i + 1}}}"
-        axes.set(title=f"Learned control ${name}$, τ = {section.tau[0]:g} s")
+        axes.set(title=f"Learned control ${name}$, τ = {section.time:g} s")
         axes.set(xlabel=section.plane.axes[0], ylabel=section.plane.axes[1])
     figure.colorbar(mesh, ax=list(panels), label="control, from its lower to its upper bound")
     return figure
@@ -66,7 +66,8 @@ def _draw_field(axes: Axes, section: Section, field: np.ndarray) -> None:
     """Draw the directions of the vector field as arrows of equal length, with both axes scaled by the box."""
     half = (np.array(section.plane.box.high) - np.array(section.plane.box.low)) / 2
     length = np.linalg.norm(field / half, axis=-1, keepdims=True)
-    arrows = field / np.where(length > 0, length, 1)
+    # A point that stands still in the plane, such as a position at rest, has no arrow.
+    arrows = np.where(length > 0, field / np.where(length > 0, length, 1), np.nan)
     first, second = (axis.numpy() for axis in section.axes)
     every = slice(None, None, -(-len(first) // ARROWS))
     shown = arrows[every, every]
