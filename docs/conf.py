@@ -167,6 +167,20 @@ reference_rooms = {
             "pirl_rl.evaluation.monte_carlo",
         ],
     ),
+    "certificates": (
+        "Certificates",
+        [
+            "pirl_rl.certificates.certificate",
+            "pirl_rl.certificates.claim",
+            "pirl_rl.certificates.deployed",
+            "pirl_rl.certificates.success",
+            "pirl_rl.certificates.threshold",
+            "pirl_rl.certificates.band",
+            "pirl_rl.certificates.states",
+            "pirl_rl.certificates.bounds",
+            "pirl_rl.certificates.sequence",
+        ],
+    ),
     "figures": (
         "Figures",
         [
@@ -186,6 +200,7 @@ reference_rooms = {
     "runs": (
         "Runs and configuration",
         [
+            "pirl_rl.runs.run",
             "pirl_rl.runs.load",
             "pirl_rl.runs.compare",
             "pirl_rl.runs.sweeps",
@@ -207,6 +222,7 @@ reference_rooms = {
             "pirl_rl.commands.console",
             "pirl_rl.commands.train",
             "pirl_rl.commands.evaluate",
+            "pirl_rl.commands.certify",
             "pirl_rl.commands.export",
             "pirl_rl.commands.tune",
             "pirl_rl.commands.catalogue",

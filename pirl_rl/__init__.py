@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from pirl_rl.losses import PIRLLoss
     from pirl_rl.operators import generator
     from pirl_rl.problem import ReachAvoidProblem
-    from pirl_rl.runs.load import Run
+    from pirl_rl.runs.run import Run
     from pirl_rl.sets import Box, Plane, band, complement, difference, intersection, union
     from pirl_rl.simulator import Simulator
 
@@ -46,7 +46,7 @@ _MODULE_OF = {
     "PIRLLoss": "pirl_rl.losses",
     "generator": "pirl_rl.operators",
     "ReachAvoidProblem": "pirl_rl.problem",
-    "Run": "pirl_rl.runs.load",
+    "Run": "pirl_rl.runs.run",
     "Simulator": "pirl_rl.simulator",
 }
 """The module of each name."""

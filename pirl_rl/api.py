@@ -21,7 +21,8 @@ from pirl_rl.evaluation import evaluate as call_evaluators
 from pirl_rl.evaluation import metrics_of
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.runs.load import Run, load_run
+from pirl_rl.runs.load import load_run
+from pirl_rl.runs.run import Run
 
 __all__ = ["check", "evaluate", "load_run", "monte_carlo", "train"]
 

@@ -20,6 +20,7 @@ from pirl_rl.evaluation import Evaluator
 from pirl_rl.grid import GridSolver
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.problem import ReachAvoidProblem, check_problem
+from pirl_rl.sampling.initial_states import InitialStates
 from pirl_rl.simulator import Simulator
 from pirl_rl.time_steps import check_time_steps, propose_time_steps
 from pirl_rl.trainer import Trainer
@@ -206,6 +207,11 @@ def make_evaluation_simulator(config: DictConfig, problem: ReachAvoidProblem) ->
     # Functions that play many paths compile it, if anything is compiled at all.
     may_compile = None if config.get("compile", True) else False
     return build(config.evaluation.simulator, "evaluation.simulator", problem=problem, compile=may_compile)
+
+
+def make_starts(config: DictConfig, trust: Sequence[str] = ()) -> InitialStates:
+    """The law of starts of the evaluator `success`."""
+    return build(config.evaluation.success, "evaluation.success", trust).initial_states
 
 
 def make_evaluators(config: DictConfig, when: str, trust: Sequence[str]) -> dict[str, Evaluator]:

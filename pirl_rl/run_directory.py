@@ -6,6 +6,7 @@
 metrics.csv             one row of metrics for each logged update
 summary.json            the verdict, the metrics of the final evaluation, and the length of the training
 evaluation.json         the metrics of a later `python -m pirl_rl.evaluate`
+certificate.json        the claims of `python -m pirl_rl.certify`
 checkpoints/            last.pt, from which the run can be resumed, and weights-<update>.pt with the networks
 grid.npz                the value and the policy on a mesh, in place of checkpoints, of a run with method=grid
 figures/                PNG files
@@ -37,6 +38,7 @@ class RunDirectory:
     METRICS = Path("metrics.csv")
     SUMMARY = Path("summary.json")
     EVALUATION = Path("evaluation.json")
+    CERTIFICATE = Path("certificate.json")
     CHECKPOINTS = Path("checkpoints")
     LAST = CHECKPOINTS / "last.pt"
     GRID = Path("grid.npz")
@@ -99,6 +101,10 @@ class RunDirectory:
     @property
     def evaluation(self) -> Path:
         return self.path / self.EVALUATION
+
+    @property
+    def certificate(self) -> Path:
+        return self.path / self.CERTIFICATE
 
     @property
     def checkpoints(self) -> Path:

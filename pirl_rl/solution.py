@@ -6,6 +6,7 @@ the training loss.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -41,6 +42,13 @@ class Solution:
     def device(self) -> torch.device:
         """The device of the networks."""
         return next(self.actor.parameters()).device
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All numbers that the policy and V are computed from, by name."""
+        states = {"actor": self.actor.state_dict(), "critic": self.critic.state_dict()}
+        return {
+            f"{kind}.{name}": entry.cpu().numpy() for kind, state in states.items() for name, entry in state.items()
+        }
 
     @torch.no_grad()
     def policy(self, tau: Tensor, x: Tensor) -> Tensor:

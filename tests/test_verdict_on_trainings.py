@@ -12,7 +12,7 @@ import pirl_rl
 from pirl_rl.errors import ProblemError
 from pirl_rl.evaluation import Verdict, statements_of
 from pirl_rl.problems import ZermeloBoat
-from pirl_rl.runs.load import Run
+from pirl_rl.runs.run import Run
 from pirl_rl.simulator import Simulator
 
 pytestmark = pytest.mark.slow

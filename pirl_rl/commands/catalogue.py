@@ -20,6 +20,10 @@ COMMANDS = (
     ("python -m pirl_rl.train +experiment=reach1d start=RUN_DIR", "start a new run with the networks of another run"),
     ("python -m pirl_rl.train +experiment=reach1d --cfg job", "show all settings"),
     ("python -m pirl_rl.evaluate run=RUN_DIR", "evaluate a run again, also with other samples or simulators"),
+    (
+        "python -m pirl_rl.certify run=RUN_DIR",
+        "bound the success of a policy and the error of its V",
+    ),
     ("python -m pirl_rl.tune +experiment=reach1d start=RUN_DIR", "continue a run in rounds that an advisor plans"),
     ("python -m pirl_rl.export run=RUN_DIR out=FOLDER", "copy the networks and the results of a run"),
     ("python -m pirl_rl.compare RUN_DIRS", "compare runs in one table and one figure"),

@@ -3,7 +3,7 @@
     python -m pirl_rl.export run=RUN_DIR out=FOLDER
 
 Copies the files that `load_run` and a reader need: the networks without target networks, replay buffer and optimisers,
-the configuration, the summary, the metrics and the figures.
+the configuration, the summary, the certificate, the metrics and the figures.
 
     run  the run directory
     out  a new folder
@@ -30,7 +30,13 @@ from pirl_rl.errors import ConfigError
 from pirl_rl.progress import helped
 from pirl_rl.run_directory import RunDirectory
 
-COPIED = (RunDirectory.SUMMARY, RunDirectory.EVALUATION, RunDirectory.METRICS, RunDirectory.FIGURES)
+COPIED = (
+    RunDirectory.SUMMARY,
+    RunDirectory.EVALUATION,
+    RunDirectory.CERTIFICATE,
+    RunDirectory.METRICS,
+    RunDirectory.FIGURES,
+)
 
 
 def export(run: Path, out: Path) -> Path:

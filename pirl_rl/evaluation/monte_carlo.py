@@ -44,7 +44,9 @@ class Estimate(NamedTuple):
 def wilson_interval(successes: Array, trials: int, confidence: float = 0.95) -> tuple[Array, Array]:
     """The score interval {p : |p_hat - p| <= z sqrt(p (1 - p) / trials)} (Wilson 1927).
 
-    It is conservative for payoffs between 0 and 1, because p (1 - p) is the largest variance that a mean of p allows.
+    Its level is approximate: the interval may miss a probability near 0 or 1 more often than it says. Those of
+    `pirl_rl.certificates` are exact. It is conservative for payoffs between 0 and 1, because p (1 - p) is the largest
+    variance that a mean of p allows.
 
     Args:
         successes: number of successes, or sum of the payoffs, in [0, trials].
@@ -107,7 +109,7 @@ def monte_carlo(
         substeps: number of integration steps in a control step.
         crossing: how exits within a step are detected, see `pirl_rl.simulator`.
         seed: seed of the noise; torch's global random generator is not used.
-        confidence: confidence level of the Wilson interval.
+        confidence: confidence level of the interval, which is approximate (Wilson 1927).
 
     Raises:
         ArgumentError: with the argument, what was expected and what was got.

@@ -44,8 +44,8 @@ class Success:
         meanings = {
             "success_rate": f"The share of {self.episodes:,} episodes without exploration noise that {goal}, from "
             f"starts drawn by {type(self.initial_states).__name__}; the hard sets count, whatever the payoff is.",
-            "success_low": "The lower end of the 95% Wilson interval of success_rate.",
-            "success_high": "The upper end of the 95% Wilson interval of success_rate.",
+            "success_low": "The lower end of the approximate 95% interval of success_rate (Wilson 1927).",
+            "success_high": "The upper end of the approximate 95% interval of success_rate (Wilson 1927).",
             "reward": "The mean payoff of the same episodes, equal to success_rate for the hard payoff.",
             "value_spread": "The standard deviation of the V of the networks alone, clamped to [0, 1], over the starts "
             "of the same episodes; it is 0 if V is constant.",

@@ -68,7 +68,7 @@ class GridSolution:
             OSError: the file cannot be written.
         """
         with replacing(path, binary=True) as file:
-            np.savez_compressed(file, allow_pickle=False, **self._arrays())
+            np.savez_compressed(file, allow_pickle=False, **self.arrays())
 
     @classmethod
     def load(cls, path: Path, problem: ReachAvoidProblem) -> GridSolution:
@@ -92,7 +92,8 @@ class GridSolution:
             )
         return solution
 
-    def _arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All numbers that the policy and V are computed from, by name."""
         mesh = self.mesh
         arrays = {
             "low": mesh.low,
@@ -105,7 +106,7 @@ class GridSolution:
             "nearest": self._nearest,
             "split": np.array(self.split),
         }
-        coarse = {} if self.coarse is None else self.coarse._arrays()
+        coarse = {} if self.coarse is None else self.coarse.arrays()
         return arrays | {f"coarse_{name}": array for name, array in coarse.items()}
 
     @classmethod
