@@ -21,8 +21,8 @@ SHORT = {
     "'evaluation.verdict.rollouts': 8}",
     "02_drift": f"MODEL = {str(MODEL)!r}\nROLLOUTS = 200",
     "03_schedules": "UPDATES, ROUNDS, CANDIDATES = 100, 1, 1\n"
-    "SETTINGS = '+experiment=reach1d compile=false pirl.final=[1,1,10] env.num_envs=256 "
-    "collector.frames_per_batch=12800 collector.warmup_frames=12800 evaluation.calibration.rollouts=64 "
+    "SETTINGS = '+experiment=reach1d compile=false check=false pirl.final=[1,1,10] env.dt=0.05 env.num_envs=256 "
+    "collector.frames_per_batch=10240 collector.warmup_frames=10240 evaluation.calibration.rollouts=64 "
     "evaluation.success.episodes=1000'",
 }
 LIMITS = {

@@ -61,6 +61,7 @@ EXPERIMENTS = [
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_every_experiment_trains(experiment, cli, tmp_path, monkeypatch):
     own = ["+debug=drift"] if experiment.startswith("drift") and experiment != "drift3" else ["+debug=default", *SMALL]
+    own.append("evaluation.during=[residuals]")  # the others are called at the end
     if experiment == "own":
         (tmp_path / "my_module.py").write_text(OWN.replace("OFFSET", "1.5"))
         sys.modules.pop("my_module", None)
@@ -267,7 +268,13 @@ def test_joblib_sweep(tmp_path):
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("environment", [{"PATH": "", "CXX": ""}, {"CXX": "false"}], ids=["none", "broken"])
+@pytest.mark.parametrize(
+    "environment",
+    [
+        pytest.param({"PATH": "", "CXX": ""}, id="none"),
+        pytest.param({"CXX": "false"}, id="broken", marks=pytest.mark.slow),
+    ],
+)
 def test_without_a_compiler_it_warns_once_and_trains(environment, tmp_path):
     cache = {"TORCHINDUCTOR_CACHE_DIR": str(tmp_path / "cache"), "TMPDIR": str(tmp_path)}
     done = command(*QUICK, *SMALL, "compile=true", cwd=tmp_path, **environment, **cache)

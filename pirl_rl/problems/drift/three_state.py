@@ -18,7 +18,7 @@ from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems.drift import vehicle
 from pirl_rl.problems.drift.equilibria import DEGREE, SPEED
 from pirl_rl.problems.drift.problem import VehicleDrift
-from pirl_rl.sets import Box, Plane, band
+from pirl_rl.sets import Box, Plane
 
 STEERING = -12 * DEGREE  # rad, delta of the equilibrium in the article
 
@@ -75,8 +75,7 @@ class VehicleDrift3(ReachAvoidProblem):
         return columns.expand(*x.shape, 3)
 
     def target_constraints(self, x: Tensor) -> Tensor:
-        coordinates = zip(x.unbind(-1), self._middle, self.tolerances.values(), strict=True)
-        return torch.stack([band(*coordinate) for coordinate in coordinates]).movedim(0, -1)
+        return (x - x.new_tensor(self._middle)).abs() - x.new_tensor([*self.tolerances.values()])
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
         beta, r, v_x = x.unbind(-1)
