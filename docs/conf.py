@@ -181,6 +181,21 @@ reference_rooms = {
             "pirl_rl.certificates.sequence",
         ],
     ),
+    "proofs": (
+        "Proofs",
+        [
+            "pirl_rl.proofs.proof",
+            "pirl_rl.proofs.conditions",
+            "pirl_rl.proofs.search",
+            "pirl_rl.proofs.subsolution",
+            "pirl_rl.proofs.target",
+            "pirl_rl.proofs.mesh",
+            "pirl_rl.proofs.spline",
+            "pirl_rl.proofs.boxes",
+            "pirl_rl.proofs.affine",
+            "pirl_rl.proofs.functions",
+        ],
+    ),
     "figures": (
         "Figures",
         [

@@ -58,6 +58,10 @@ class AdvisorError(PirlError, RuntimeError):
     """An advisor gave no answer; the message says why and contains no API key."""
 
 
+class ProofError(PirlError, ValueError):
+    """Nothing can be proved, because a function or a problem is beyond the method; the message says which and why."""
+
+
 class Interrupted(PirlError):
     """A user stopped training, whose state is saved.
 

@@ -7,6 +7,7 @@ metrics.csv             one row of metrics for each logged update
 summary.json            the verdict, the metrics of the final evaluation, and the length of the training
 evaluation.json         the metrics of a later `python -m pirl_rl.evaluate`
 certificate.json        the claims of `python -m pirl_rl.certify`
+proof.json, proof.npz   what `python -m pirl_rl.certify method=interval` proved, in words and as a function
 checkpoints/            last.pt, from which the run can be resumed, and weights-<update>.pt with the networks
 grid.npz                the value and the policy on a mesh, in place of checkpoints, of a run with method=grid
 figures/                PNG files
@@ -39,6 +40,8 @@ class RunDirectory:
     SUMMARY = Path("summary.json")
     EVALUATION = Path("evaluation.json")
     CERTIFICATE = Path("certificate.json")
+    PROOF = Path("proof.json")
+    BOUND = Path("proof.npz")
     CHECKPOINTS = Path("checkpoints")
     LAST = CHECKPOINTS / "last.pt"
     GRID = Path("grid.npz")
@@ -105,6 +108,15 @@ class RunDirectory:
     @property
     def certificate(self) -> Path:
         return self.path / self.CERTIFICATE
+
+    @property
+    def proof(self) -> Path:
+        return self.path / self.PROOF
+
+    @property
+    def bound(self) -> Path:
+        """The function that is a proved lower bound of the probability of success."""
+        return self.path / self.BOUND
 
     @property
     def checkpoints(self) -> Path:

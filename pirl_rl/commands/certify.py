@@ -1,10 +1,15 @@
-"""Certify a run: exact statistical bounds of what its frozen policy does.
+"""Certify a run: exact statistical bounds of what its frozen policy does, or a proof.
 
     python -m pirl_rl.certify run=RUN_DIR [claims=[success,threshold,band]] [key=value ...]
+    python -m pirl_rl.certify run=RUN_DIR method=interval [key=value ...]
 
 Plays new paths of the policy, and writes what follows from them, whatever the law of the paths is, to certificate.json
 in the run directory. A certificate counts if it is made once: `picked_from` is the number of runs, or of seeds, out of
 which the best one is shown.
+
+With method=interval it proves a lower bound of the probability of success for all states at once, with certainty, and
+writes it to proof.json and proof.npz. The bound is about continuous feedback, and the statistical claims are about the
+simulator, which holds each control for a step. Problems have at most three states.
 
     run          the directory of a finished run
     claims       success: a lower bound of the probability of success;
@@ -24,10 +29,16 @@ which the best one is shown.
     seed         the seed of starts and noise, 0 by default
     trust        modules of your own that the run may import, such as trust=[my_module]
 
+    With method=interval:
+    cells, steps the numbers of cells of the bound along each state and along tau, 80 by default
+    rounds       the largest number of times that the bound is fitted, 20 by default
+    halvings     the number of times that a box may be halved, 8 by default
+
 Examples:
     python -m pirl_rl.certify run=runs/reach1d/2026-01-31_12-00-00-0
     python -m pirl_rl.certify run=models/drift claims=[success] at_least=0.3
     python -m pirl_rl.certify run=my_run tau=2 x=[0.0] confidence=0.99
+    python -m pirl_rl.certify run=runs/reach1d/2026-01-31_12-00-00-0 method=interval
 """
 
 from __future__ import annotations
@@ -46,12 +57,16 @@ from pirl_rl.commands.console import quiet_libraries, reported
 from pirl_rl.errors import ConfigError
 from pirl_rl.files import replacing
 from pirl_rl.progress import announce, helped
+from pirl_rl.proofs.proof import LEVELS
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.runs.load import load_run
 from pirl_rl.runs.run import Run
 
-SETTINGS = {*inspect.signature(Run.certify).parameters} - {"self", "starts"}
-"""The arguments of `Run.certify` that have a place on a command line."""
+SETTINGS = {
+    "statistical": {*inspect.signature(Run.certify).parameters} - {"self", "starts"},
+    "interval": {*inspect.signature(Run.prove).parameters} - {"self"},
+}
+"""The arguments of `Run.certify` and `Run.prove` that have a place on a command line, by method."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -64,26 +79,61 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with reported(folder):
         if not named:
             raise ConfigError("run: expected run=RUN_DIR, the directory of a finished run")
-        settings = _settings([item for item in arguments if item not in named])
-        run = load_run(folder, settings.pop("trust", ()))
-        directory = RunDirectory(folder)
+        others = [item for item in arguments if item not in named]
+        methods = [item.partition("=")[2] for item in others if item.startswith("method=")]
+        method = methods[-1] if methods else "statistical"
+        settings = _settings(method, [item for item in others if not item.startswith("method=")])
+        run, directory = load_run(folder, settings.pop("trust", ())), RunDirectory(folder)
         directory.refuse_links()
-        announce("playing the policy")
-        certificate = run.certify(**settings)
-        with replacing(directory.certificate) as file:
-            file.write(json.dumps(certificate.to_dict(), indent=2) + "\n")
-    for name, claim in certificate.claims.items():
-        print(f"{name:<10}" + f"\n{'':<10}".join(claim.sentences))
-    print(f"written   {directory.certificate}")
+        lines = _prove(run, directory, settings) if method == "interval" else _certify(run, directory, settings)
+    print("\n".join(lines))
 
 
-def _settings(arguments: Sequence[str]) -> dict[str, Any]:
-    """The arguments of `Run.certify`, and `trust`, from a command line.
+def _certify(run: Run, directory: RunDirectory, settings: dict[str, Any]) -> list[str]:
+    """Write a statistical certificate, and return what it says."""
+    announce("playing the policy")
+    certificate = run.certify(**settings)
+    with replacing(directory.certificate) as file:
+        file.write(json.dumps(certificate.to_dict(), indent=2) + "\n")
+    lines = [f"{name:<10}" + f"\n{'':<10}".join(claim.sentences) for name, claim in certificate.claims.items()]
+    return [*lines, f"written   {directory.certificate}"]
+
+
+def _prove(run: Run, directory: RunDirectory, settings: dict[str, Any]) -> list[str]:
+    """Write a proof, and return what it says."""
+    proof = run.prove(**settings)
+    found = proof.to_dict(run.problem)
+    with replacing(directory.proof) as file:
+        file.write(json.dumps(found, indent=2) + "\n")
+    if not proof.holds:
+        resist = [f"unproved  {name}, on {len(boxes):,} boxes" for name, boxes in proof.unproved.items()]
+        return ["Nothing is proved: some conditions resist.", *resist, f"written   {directory.proof}"]
+    proof.save(directory.bound)
+    horizon = run.problem.horizon
+    return [
+        f"proved    Under continuous feedback the policy succeeds from {found['best_state']} with {horizon:g} s to go",
+        f"          with probability at least {found['best']:.4f}, and on average over the box of states at least "
+        f"{found['mean']:.4f}.",
+        *(
+            f"          {found[f'share_at_least_{level:g}']:.1%} of it succeed with {level:g} or more."
+            for level in LEVELS
+        ),
+        "          The bound is not about a simulator, which holds each control for a step.",
+        f"boxes     {proof.boxes:,}, in {proof.seconds:.0f} s",
+        f"written   {directory.proof}",
+        f"written   {directory.bound}",
+    ]
+
+
+def _settings(method: str, arguments: Sequence[str]) -> dict[str, Any]:
+    """The arguments of `Run.certify` or `Run.prove`, and `trust`, from a command line.
 
     Raises:
-        ConfigError: an argument is unknown, or cannot be read.
+        ConfigError: the method or an argument is unknown, or an argument cannot be read.
     """
-    known = {*SETTINGS, "trust"}
+    if method not in SETTINGS:
+        raise ConfigError(f"method: expected {' or '.join(SETTINGS)}, got {method!r}")
+    known = {*SETTINGS[method], "trust"}
     for text in arguments:
         if "=" not in text or text.partition("=")[0] not in known:
             raise ConfigError(f"{text}: expected key=value with a key out of {', '.join(sorted(known))}")

@@ -34,6 +34,8 @@ COPIED = (
     RunDirectory.SUMMARY,
     RunDirectory.EVALUATION,
     RunDirectory.CERTIFICATE,
+    RunDirectory.PROOF,
+    RunDirectory.BOUND,
     RunDirectory.METRICS,
     RunDirectory.FIGURES,
 )

@@ -15,12 +15,13 @@ from torch import Tensor
 from pirl_rl.arguments import checked_points, seeded
 from pirl_rl.ascent import look_ahead_policy
 from pirl_rl.assembly import make_evaluation_simulator, make_simulator, make_starts
-from pirl_rl.certificates import Certificate, LawOfStarts, OneStart, certify, make_certifiers
+from pirl_rl.certificates import Certificate, Deployed, LawOfStarts, OneStart, certify, make_certifiers
 from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.monte_carlo import Estimate, monte_carlo
 from pirl_rl.evaluation.trajectories import Trajectories, closed_loop
 from pirl_rl.grid import GridSolution
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.proofs import Proof, Settings, prove_success
 from pirl_rl.sampling.initial_states import InitialStates
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
@@ -204,6 +205,21 @@ class Run:
         names = claims if claims is not None else ("success",) if x is not None else ("success", "threshold", "band")
         certifiers = make_certifiers(names, episodes, at_least, states, rollouts, share, success)
         return certify(self.solution, simulator, where, certifiers, confidence, picked_from, seed)
+
+    def prove(self, cells: int = 80, steps: int = 80, rounds: int = 20, halvings: int = 8) -> Proof:
+        """Prove a lower bound of the policy's probability of success under continuous feedback, see `pirl_rl.proofs`.
+
+        Args:
+            cells: the number of cells of the bound's mesh along each state, at most three.
+            steps: the number of its cells along tau.
+            rounds: the largest number of times that the bound is fitted.
+            halvings: the number of times that a box may be halved.
+
+        Raises:
+            ProofError: the problem has too many states, or a function whose enclosure is not known.
+        """
+        networks = Deployed(self.solution, self.simulator).digest()
+        return prove_success(self.solution, networks, Settings(cells, steps, rounds, halvings))
 
     def _simulator(self, dt: float | None, substeps: int | None, crossing: Crossing | None) -> Simulator:
         return _changed(self.simulator, dt, substeps, crossing)

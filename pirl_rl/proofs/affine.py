@@ -1,0 +1,240 @@
+"""Affine arithmetic: enclosures of functions over boxes, which hold in spite of rounding.
+
+A number that depends on the point z of a box is enclosed by an affine form of the box's coordinates e in [-1, 1]^d,
+
+    z(e) = centre + sum_i slope_i e_i + error,    |error| <= radius,
+
+after J. L. D. Comba and J. Stolfi, SIBGRAPI 1993, with one term for each coordinate and one for all that is not linear.
+The enclosure of a smooth function is wrong by the square of the box's size, where an interval is by the size itself.
+
+Forms go through functions that are written for tensors, such as the drift of a problem or the layers of a network,
+since they answer the calls of torch's functions (`__torch_function__`). A function that is not known is refused.
+
+Rounding: each operation widens the radius by a bound of its own rounding errors. Sums and products of doubles are
+exact to `ROUNDING` of the magnitudes that enter. Elementary functions of torch are taken to be exact to eight times
+that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pirl_rl.errors import ProofError
+
+ROUNDING = 2.0**-52
+"""Twice the relative error of one operation of doubles."""
+
+Number = float | int | Tensor
+
+
+class Affine:
+    """Affine forms of shape (N, *), one for each of N boxes and each entry.
+
+    Args:
+        centre: (N, *), float64.
+        slopes: (d, N, *), the change of the form along half a side of the box.
+        radius: (N, *), >= 0.
+    """
+
+    def __init__(self, centre: Tensor, slopes: Tensor, radius: Tensor):
+        self.centre, self.slopes, self.radius = centre, slopes, radius
+
+    @classmethod
+    def of_box(cls, centre: Tensor, half_width: Tensor) -> Affine:
+        """The coordinates (N, d) of points of N boxes with centres (N, d) and halves of their sides (N, d)."""
+        slopes = torch.diag_embed(half_width).movedim(1, 0)
+        return cls(centre, slopes, ROUNDING * (centre.abs() + half_width))
+
+    @classmethod
+    def of_constant(cls, value: Tensor, like: Affine) -> Affine:
+        """Forms with an exact value that broadcasts to (N, *)."""
+        value = value.to(torch.float64)
+        return cls(value, value.new_zeros((len(like.slopes), *value.shape)), torch.zeros_like(value))
+
+    # Bounds
+
+    @property
+    def spread(self) -> Tensor:
+        """The largest distance (N, *) from the centre."""
+        return self.slopes.abs().sum(0) + self.radius
+
+    @property
+    def magnitude(self) -> Tensor:
+        """A bound (N, *) of the absolute value."""
+        return self.centre.abs() + self.spread
+
+    @property
+    def low(self) -> Tensor:
+        """A lower bound (N, *)."""
+        return self.centre - self.spread - 2 * ROUNDING * self.magnitude
+
+    @property
+    def high(self) -> Tensor:
+        """An upper bound (N, *)."""
+        return self.centre + self.spread + 2 * ROUNDING * self.magnitude
+
+    # Structure, as of a tensor of shape (N, *)
+
+    @property
+    def shape(self) -> torch.Size:
+        return self.centre.shape
+
+    @property
+    def ndim(self) -> int:
+        return self.centre.ndim
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return self.centre.dtype
+
+    @property
+    def device(self) -> torch.device:
+        return self.centre.device
+
+    def __len__(self) -> int:
+        return len(self.centre)
+
+    def new_tensor(self, data: Any, **_: Any) -> Tensor:
+        return torch.as_tensor(data, dtype=torch.float64)
+
+    def new_zeros(self, *shape: Any, **_: Any) -> Tensor:
+        return torch.zeros(*shape, dtype=torch.float64)
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Affine:
+        """The forms after a change of shape that leaves the leading axis where it is."""
+        return Affine(change(self.centre), torch.vmap(change)(self.slopes), change(self.radius))
+
+    def __getitem__(self, index: Any) -> Affine:
+        return self.map(lambda entry: entry[index])
+
+    def __getattr__(self, name: str) -> Any:
+        """The methods of tensors are torch's functions of the same name."""
+        function = getattr(torch.Tensor, name, None) if not name.startswith("_") else None
+        if function is None:
+            raise AttributeError(name)
+        return lambda *args, **kwargs: self.__torch_function__(function, (), (self, *args), kwargs)
+
+    @classmethod
+    def __torch_function__(cls, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Any = None) -> Any:
+        from pirl_rl.proofs.functions import FUNCTIONS
+
+        name = getattr(func, "__name__", str(func)).strip("_")
+        if name not in FUNCTIONS:
+            raise ProofError(f"torch.{name}: no enclosure of this function is known, so that nothing can be proved")
+        return FUNCTIONS[name](*args, **(kwargs or {}))
+
+    # Arithmetic
+
+    def _plus(self, other: Affine | Number, sign: float) -> Affine:
+        if not isinstance(other, Affine):
+            other = Affine.of_constant(torch.as_tensor(other, dtype=torch.float64), self)
+        centre = self.centre + sign * other.centre
+        own, others = torch.broadcast_tensors(_padded(self.slopes, centre.ndim), _padded(other.slopes, centre.ndim))
+        slopes = own + sign * others
+        magnitude = self.magnitude + other.magnitude
+        return Affine(centre, slopes, self.radius + other.radius + 2 * ROUNDING * magnitude)
+
+    def __add__(self, other: Affine | Number) -> Affine:
+        return self._plus(other, 1.0)
+
+    def __sub__(self, other: Affine | Number) -> Affine:
+        return self._plus(other, -1.0)
+
+    def __rsub__(self, other: Number) -> Affine:
+        return (-self)._plus(other, 1.0)
+
+    def __neg__(self) -> Affine:
+        return Affine(-self.centre, -self.slopes, self.radius)
+
+    def __mul__(self, other: Affine | Number) -> Affine:
+        if not isinstance(other, Affine):
+            other = torch.as_tensor(other, dtype=torch.float64)
+            radius = (self.radius + 2 * ROUNDING * self.magnitude) * other.abs()
+            return Affine(self.centre * other, self.slopes * other, radius)
+        ndim = max(self.ndim, other.ndim)
+        own, others = _padded(self.slopes, ndim), _padded(other.slopes, ndim)
+        slopes = self.centre * others + other.centre * own
+        spreads = own.abs().sum(0), others.abs().sum(0)
+        # The products of slopes e_i e_j, and all products with a radius.
+        radius = spreads[0] * spreads[1] + self.radius * (other.centre.abs() + spreads[1] + other.radius)
+        radius = radius + other.radius * (self.centre.abs() + spreads[0])
+        return Affine(self.centre * other.centre, slopes, radius + 8 * ROUNDING * self.magnitude * other.magnitude)
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def __truediv__(self, other: Affine | Number) -> Affine:
+        if isinstance(other, Affine):
+            return self * other.reciprocal()
+        return self * (1 / torch.as_tensor(other, dtype=torch.float64))
+
+    def __rtruediv__(self, other: Number) -> Affine:
+        return self.reciprocal() * other
+
+    def __pow__(self, exponent: int) -> Affine:
+        if not (isinstance(exponent, int) and exponent >= 1):
+            raise ProofError(f"**: expected an integer power >= 1, got {exponent!r}")
+        half = self ** (exponent // 2) if exponent > 1 else self
+        if exponent == 1:
+            return self
+        return half.square() if exponent % 2 == 0 else half.square() * self
+
+    def smooth(
+        self,
+        function: Callable[[Tensor], Tensor],
+        slope: Callable[[Tensor], Tensor],
+        curvature: Callable[[Tensor, Tensor], Tensor],
+        monotone: bool = False,
+    ) -> Affine:
+        """A function of the forms by its tangent: |phi(z) - phi(c) - phi'(c) (z - c)| <= max |phi''| (z - c)^2 / 2.
+
+        Args:
+            function: phi.
+            slope: phi'.
+            curvature: a bound of |phi''| over intervals, from their lower and their upper ends.
+            monotone: whether phi never falls, so that its values at both ends enclose it too.
+        """
+        value, slope_ = function(self.centre), slope(self.centre)
+        spread, low, high = self.spread, self.low, self.high
+        radius = slope_.abs() * self.radius + curvature(low, high) * spread.square() / 2
+        rounding = 8 * ROUNDING * (value.abs() + slope_.abs() * self.magnitude)
+        result = Affine(value, slope_ * self.slopes, radius + rounding)
+        if not monotone:
+            return result
+        least, most = function(low), function(high)
+        middle, half = (least + most) / 2, (most - least) / 2 + 8 * ROUNDING * (least.abs() + most.abs())
+        return result.where(result.radius <= half, Affine(middle, torch.zeros_like(result.slopes), half))
+
+    def where(self, condition: Tensor, other: Affine | Number) -> Affine:
+        """These forms where the condition holds, and the others elsewhere."""
+        if not isinstance(other, Affine):
+            other = Affine.of_constant(torch.as_tensor(other, dtype=torch.float64), self)
+        parts = ((self.centre, other.centre), (self.slopes, other.slopes), (self.radius, other.radius))
+        return Affine(*(torch.where(condition, a, b) for a, b in parts))
+
+    def matmul(self, matrix: Tensor) -> Affine:
+        """The product (N, k) of forms (N, l) with a matrix (l, k)."""
+        matrix = matrix.to(torch.float64)
+        size = matrix.abs()
+        terms = (matrix.shape[-2] + 4) * ROUNDING
+        radius = self.radius @ size + terms * (self.magnitude @ size)
+        return Affine(self.centre @ matrix, self.slopes @ matrix, radius)
+
+    def sum(self, dim: int = -1, keepdim: bool = False) -> Affine:
+        """The sum over an axis other than the leading one, counted from the end."""
+        if dim >= 0:
+            dim -= self.ndim
+        terms = self.shape[dim] * ROUNDING * self.magnitude.sum(dim, keepdim=keepdim)
+        return Affine(
+            self.centre.sum(dim, keepdim=keepdim),
+            self.slopes.sum(dim, keepdim=keepdim),
+            self.radius.sum(dim, keepdim=keepdim) + terms,
+        )
+
+
+def _padded(slopes: Tensor, ndim: int) -> Tensor:
+    """Slopes (d, N, *) with axes of length 1 after the first, so that they broadcast like forms of `ndim` axes."""
+    return slopes.reshape(len(slopes), *[1] * (ndim + 1 - slopes.ndim), *slopes.shape[1:])

@@ -1,0 +1,285 @@
+"""Enclosures of torch's functions, by their names."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pirl_rl.errors import ProofError
+from pirl_rl.proofs.affine import Affine, Number
+
+LEAST = 1e-12
+"""An argument of a root, a logarithm or a reciprocal must be above this in the whole box."""
+
+
+def _tanh(z: Affine) -> Affine:
+    """|tanh''| = 2 |tanh| (1 - tanh^2) rises up to |z| = 0.6585, where it is 0.7699, and falls beyond."""
+    steepest = math.atanh(1 / math.sqrt(3))
+
+    def curvature(low: Tensor, high: Tensor) -> Tensor:
+        least, most = _distances(low, high)
+        y = torch.tanh(least.clamp(min=steepest).where(most > steepest, most))
+        return 2 * y * (1 - y.square()) * (1 + 1e-12)
+
+    return z.smooth(torch.tanh, lambda c: 1 - torch.tanh(c).square(), curvature, True)
+
+
+def _sigmoid(z: Affine) -> Affine:
+    def slope(c: Tensor) -> Tensor:
+        y = torch.sigmoid(c)
+        return y * (1 - y)
+
+    return z.smooth(torch.sigmoid, slope, _constant(1 / (6 * math.sqrt(3))), True)
+
+
+def _silu(z: Affine) -> Affine:
+    """z / (1 + exp(-z)), whose second derivative is even.
+
+    It falls from 0.5 at z = 0 to 0 at |z| = 2.3994 and on to -0.0369 at |z| = 3.4358, and rises towards 0 from there.
+    """
+
+    def curvature(low: Tensor, high: Tensor) -> Tensor:
+        least, _ = _distances(low, high)
+        y = torch.sigmoid(least)
+        size = (y * (1 - y) * (2 + least * (1 - 2 * y))).abs()
+        return torch.where(least < 3.44, size.clamp(min=0.04), size) * (1 + 1e-12)
+
+    def slope(c: Tensor) -> Tensor:
+        y = torch.sigmoid(c)
+        return y + c * y * (1 - y)
+
+    return z.smooth(torch.nn.functional.silu, slope, curvature)
+
+
+def _softplus(z: Affine, beta: float = 1.0, threshold: float = 20.0) -> Affine:
+    if beta != 1.0:
+        raise ProofError(f"softplus: expected beta = 1, got {beta}")
+    # Beyond its threshold torch returns z itself, which is wrong by at most exp(-threshold).
+    result = z.smooth(torch.nn.functional.softplus, torch.sigmoid, _constant(0.25), True)
+    return Affine(result.centre, result.slopes, result.radius + math.exp(-threshold))
+
+
+def _sqrt(z: Affine) -> Affine:
+    _require("sqrt", z.low)
+    return z.smooth(torch.sqrt, lambda c: 0.5 / c.sqrt(), lambda low, high: 0.25 * low.pow(-1.5), True)
+
+
+def _exp(z: Affine) -> Affine:
+    return z.smooth(torch.exp, torch.exp, lambda low, high: high.exp(), True)
+
+
+def _log(z: Affine) -> Affine:
+    _require("log", z.low)
+    return z.smooth(torch.log, torch.reciprocal, lambda low, high: low.pow(-2), True)
+
+
+def _tan(z: Affine) -> Affine:
+    largest = z.magnitude
+    if not bool((largest < math.pi / 2 - 1e-6).all()):
+        raise ProofError("tan: its argument reaches pi/2 in a box")
+
+    def curvature(low: Tensor, high: Tensor) -> Tensor:
+        tangent = torch.maximum(low.abs(), high.abs()).tan()
+        return 2 * tangent * (1 + tangent.square())
+
+    return z.smooth(torch.tan, lambda c: 1 + c.tan().square(), curvature, True)
+
+
+def _atan(z: Affine) -> Affine:
+    return z.smooth(torch.atan, lambda c: 1 / (1 + c.square()), _constant(3 * math.sqrt(3) / 8), True)
+
+
+def _sin(z: Affine) -> Affine:
+    return _bounded(z.smooth(torch.sin, torch.cos, _constant(1.0)))
+
+
+def _cos(z: Affine) -> Affine:
+    return _bounded(z.smooth(torch.cos, lambda c: -c.sin(), _constant(1.0)))
+
+
+def _bounded(result: Affine) -> Affine:
+    """Forms of values in [-1, 1]; wide ones become that interval."""
+    zeros, ones = torch.zeros_like(result.centre), torch.ones_like(result.radius)
+    return result.where(result.spread <= 1, Affine(zeros, torch.zeros_like(result.slopes), ones))
+
+
+def _square(z: Affine) -> Affine:
+    return z.smooth(torch.square, lambda c: 2 * c, _constant(2.0))
+
+
+def _reciprocal(z: Affine) -> Affine:
+    """1/z of forms with one sign; that of negative ones is -1/(-z)."""
+    sign = z.centre.sign()
+    positive = z * sign
+    _require("division", positive.low)
+    result = positive.smooth(torch.reciprocal, lambda c: -1 / c.square(), lambda low, high: 2 * low.pow(-3))
+    return result * sign
+
+
+def _abs(z: Affine) -> Affine:
+    """|z|; where z changes its sign, the best line between the chord of |z| and a parallel through its corner."""
+    low, high = z.low, z.high
+    width = (high - low).clamp(min=1e-300)
+    line = ((high.abs() - low.abs()) / width).clamp(-1, 1)
+    line = torch.where(low >= 0, 1.0, torch.where(high <= 0, -1.0, line))
+    gap = torch.where((low < 0) & (high > 0), torch.maximum((1 - line) * high, (1 + line) * -low) / 2, 0.0)
+    tilted = z * line
+    return Affine(tilted.centre + gap, tilted.slopes, tilted.radius + gap * (1 + 1e-12))
+
+
+def _maximum(a: Affine | Tensor, b: Affine | Tensor) -> Affine:
+    return (a + b + _abs(_form(a, b) - b)) * 0.5  # type: ignore[operator]
+
+
+def _minimum(a: Affine | Tensor, b: Affine | Tensor) -> Affine:
+    return (a + b - _abs(_form(a, b) - b)) * 0.5  # type: ignore[operator]
+
+
+def _clamp(z: Affine, min: Number | None = None, max: Number | None = None) -> Affine:
+    if min is not None:
+        z = _maximum(z, torch.as_tensor(min, dtype=torch.float64))
+    return z if max is None else _minimum(z, torch.as_tensor(max, dtype=torch.float64))
+
+
+def _extreme(pairwise: Callable[[Affine, Affine], Affine]) -> Callable[..., Affine]:
+    def reduced(z: Affine, dim: int = -1, keepdim: bool = False) -> Affine:
+        result, *others = _unbind(z, dim)
+        for other in others:
+            result = pairwise(result, other)
+        return _unsqueeze(result, dim) if keepdim else result
+
+    return reduced
+
+
+def _norm(z: Affine, p: Any = None, dim: Any = -1, keepdim: bool = False, **_: Any) -> Affine:
+    """The Euclidean norm; where it can be 0 in a box, an interval."""
+    squares = _square(z).sum(dim if isinstance(dim, int) else dim[0], keepdim=keepdim)
+    low, high = squares.low.clamp(min=0).sqrt(), squares.high.clamp(min=0).sqrt()
+    interval = Affine((low + high) / 2, torch.zeros_like(squares.slopes), (high - low) / 2 + 1e-15 * high)
+    safe = squares.low > LEAST
+    shifted = squares.where(safe, torch.ones_like(squares.centre))
+    return _sqrt(shifted).where(safe, interval)
+
+
+def _form(value: Affine | Tensor | float, like: Any) -> Affine:
+    if isinstance(value, Affine):
+        return value
+    return Affine.of_constant(torch.as_tensor(value, dtype=torch.float64), like)
+
+
+def _join(join: Callable[..., Tensor]) -> Callable[..., Affine]:
+    def joined(parts: Sequence[Affine | Tensor], dim: int = 0) -> Affine:
+        like = next(part for part in parts if isinstance(part, Affine))
+        forms = [_form(part, like) for part in parts]
+        ndim = like.ndim + (join is torch.stack)
+        dim = dim if dim < 0 else dim - ndim
+        shape = like.shape if join is torch.stack else None
+        entries = [(form.centre, form.slopes, form.radius) for form in forms]
+        if shape is not None:
+            entries = [(c.expand(shape), s.expand(len(s), *shape), r.expand(shape)) for c, s, r in entries]
+        return Affine(*(join(part, dim) for part in zip(*entries, strict=True)))
+
+    return joined
+
+
+def _unbind(z: Affine, dim: int = 0) -> list[Affine]:
+    dim = dim if dim < 0 else dim - z.ndim
+    return [Affine(*parts) for parts in zip(*(e.unbind(dim) for e in (z.centre, z.slopes, z.radius)), strict=True)]
+
+
+def _unsqueeze(z: Affine, dim: int) -> Affine:
+    dim = dim if dim < 0 else dim - z.ndim - 1
+    return Affine(*(entry.unsqueeze(dim) for entry in (z.centre, z.slopes, z.radius)))
+
+
+def _expand(z: Affine, *shape: Any) -> Affine:
+    sizes = tuple(shape[0]) if len(shape) == 1 and isinstance(shape[0], (tuple, list, torch.Size)) else shape
+    return Affine(z.centre.expand(sizes), z.slopes.expand(len(z.slopes), *sizes), z.radius.expand(sizes))
+
+
+def _where(condition: Tensor, a: Affine | Tensor, b: Affine | Tensor) -> Affine:
+    if isinstance(condition, Affine):
+        raise ProofError("torch.where: expected a condition that does not depend on the state")
+    return _form(a, b).where(condition, b)
+
+
+def _like(make: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    return lambda z, **_: make(z.centre)
+
+
+def _filled(z: Affine, value: float, **_: Any) -> Tensor:
+    return torch.full_like(z.centre, value)
+
+
+def _to(value: Any, *_: Any, **__: Any) -> Any:
+    """Forms are double precision on the CPU; a tensor that is moved to the kind of a form becomes that too."""
+    return value if isinstance(value, Affine) else value.to("cpu", torch.float64)
+
+
+def _distances(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """The least and the largest absolute value in intervals."""
+    least = torch.where((low < 0) & (high > 0), torch.zeros_like(low), torch.minimum(low.abs(), high.abs()))
+    return least, torch.maximum(low.abs(), high.abs())
+
+
+def _require(name: str, low: Tensor) -> None:
+    if not bool((low > LEAST).all()):
+        raise ProofError(f"{name}: its argument is not positive in a box")
+
+
+def _constant(bound: float) -> Callable[[Tensor, Tensor], Tensor]:
+    return lambda low, high: torch.full_like(low, bound)
+
+
+FUNCTIONS: dict[str, Callable[..., Any]] = {
+    "add": lambda a, b: _form(a, b) + b,
+    "sub": lambda a, b: _form(a, b) - b,
+    "rsub": lambda a, b: _form(b, a) - a,
+    "mul": lambda a, b: _form(a, b) * b,
+    "div": lambda a, b: _form(a, b) / b,
+    "truediv": lambda a, b: _form(a, b) / b,
+    "neg": lambda a: -a,
+    "pow": lambda a, b: a ** (int(b) if b == int(b) else b),
+    "square": _square,
+    "reciprocal": _reciprocal,
+    "abs": _abs,
+    "sqrt": _sqrt,
+    "exp": _exp,
+    "log": _log,
+    "sin": _sin,
+    "cos": _cos,
+    "tan": _tan,
+    "atan": _atan,
+    "tanh": _tanh,
+    "sigmoid": _sigmoid,
+    "silu": lambda z, inplace=False: _silu(z),
+    "softplus": _softplus,
+    "relu": lambda z, inplace=False: _clamp(z, min=0.0),
+    "maximum": _maximum,
+    "minimum": _minimum,
+    "clamp": _clamp,
+    "amax": _extreme(_maximum),
+    "amin": _extreme(_minimum),
+    "norm": _norm,
+    "vector_norm": _norm,
+    "sum": lambda z, dim=-1, keepdim=False: z.sum(dim, keepdim),
+    "matmul": lambda a, b: a.matmul(b),
+    "cat": _join(torch.cat),
+    "concat": _join(torch.cat),
+    "stack": _join(torch.stack),
+    "unbind": _unbind,
+    "unsqueeze": _unsqueeze,
+    "squeeze": lambda z, dim: z.map(lambda entry: entry.squeeze(dim)),
+    "expand": _expand,
+    "clone": lambda z: z,
+    "where": _where,
+    "to": _to,
+    "ones_like": _like(torch.ones_like),
+    "zeros_like": _like(torch.zeros_like),
+    "full_like": _filled,
+}
+"""The enclosure of each function, with the arguments of torch's."""
