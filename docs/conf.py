@@ -181,6 +181,16 @@ reference_rooms = {
             "pirl_rl.certificates.sequence",
         ],
     ),
+    "deployment": (
+        "Models for other programs",
+        [
+            "pirl_rl.deployment",
+            "pirl_rl.deployment.program",
+            "pirl_rl.deployment.graph",
+            "pirl_rl.deployment.model",
+            "pirl_rl.deployment.description",
+        ],
+    ),
     "figures": (
         "Figures",
         [
