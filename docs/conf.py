@@ -196,6 +196,16 @@ reference_rooms = {
             "pirl_rl.proofs.functions",
         ],
     ),
+    "deployment": (
+        "Models for other programs",
+        [
+            "pirl_rl.deployment",
+            "pirl_rl.deployment.program",
+            "pirl_rl.deployment.graph",
+            "pirl_rl.deployment.model",
+            "pirl_rl.deployment.description",
+        ],
+    ),
     "figures": (
         "Figures",
         [

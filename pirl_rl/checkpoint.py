@@ -6,12 +6,14 @@ are read with `weights_only=True`, so that loading an untrusted file runs no cod
 
 from __future__ import annotations
 
+import hashlib
 import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from pirl_rl.errors import ArgumentError, CheckpointError
@@ -141,6 +143,15 @@ def check_entries(state: Any, expected: Any, key: str = "") -> None:
         shape = tuple(state.shape) if isinstance(state, torch.Tensor) else type(state).__name__
         if shape != tuple(expected.shape):
             raise ArgumentError(f"{key}: expected shape {tuple(expected.shape)}, got {shape}")
+
+
+def digest(arrays: Mapping[str, np.ndarray]) -> str:
+    """The SHA-256 of arrays with their names, dtypes and shapes, in hexadecimal digits."""
+    total = hashlib.sha256()
+    for name, array in sorted(arrays.items()):
+        total.update(f"{name} {array.dtype} {array.shape}".encode())
+        total.update(np.ascontiguousarray(array).tobytes())
+    return total.hexdigest()
 
 
 def restore_rng(rng: torch.Generator, state: torch.Tensor) -> None:

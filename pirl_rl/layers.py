@@ -57,8 +57,12 @@ class RootTime(nn.Module):
         super().__init__()
         self.tau_0 = tau_0
 
+    def root(self, tau: Tensor) -> Tensor:
+        """sqrt(tau + tau_0) (*), in sqrt(s), of times to go (*)."""
+        return torch.sqrt(tau + self.tau_0)
+
     def forward(self, x: Tensor) -> Tensor:
-        return torch.cat([x, torch.sqrt(x[..., :1] + self.tau_0)], -1)
+        return torch.cat([x, self.root(x[..., :1])], -1)
 
 
 class Levels(nn.Module):

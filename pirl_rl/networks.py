@@ -78,7 +78,8 @@ def _levels(problem: ReachAvoidProblem) -> tuple[Levels, Tensor, Tensor]:
     middle, width = sampled.mean(0), sampled.std(0)
     # A level that is constant or infinite says nothing.
     kept = ((width > 0) & width.isfinite()).nonzero().flatten().tolist()
-    return Levels(partial(_constraints, problem, kept), problem.states.dim), middle[kept], width[kept]
+    levels = partial(_constraints, problem, kept if len(kept) < len(width) else None)
+    return Levels(levels, problem.states.dim), middle[kept], width[kept]
 
 
 def _with_periods(box: Box, states: Box) -> Box:
@@ -245,6 +246,20 @@ def stack(critics: Sequence[Critic]) -> Critic:
         for key in layer._buffers:
             setattr(layer, key, torch.stack([getattr(one, key) for one in layers]))
     return twin
+
+
+def unstack(critic: Critic) -> list[Critic]:
+    """The critics, with parameters of their own, that `stack` has made one of."""
+    critics = []
+    for i in range(len(next(critic.parameters()))):
+        one = copy.deepcopy(critic)
+        for layer in one.layers:
+            for key in layer._parameters:
+                setattr(layer, key, nn.Parameter(getattr(layer, key)[i].detach()))
+            for key in layer._buffers:
+                setattr(layer, key, getattr(layer, key)[i])
+        critics.append(one)
+    return critics
 
 
 class CriticValue:

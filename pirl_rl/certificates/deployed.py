@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import hashlib
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -12,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pirl_rl.checkpoint import digest
 from pirl_rl.evaluation.inputs import like, noise_rng, points_rng
 from pirl_rl.evaluation.monte_carlo import mean_payoff
 from pirl_rl.payoffs import Indicator
@@ -114,11 +114,7 @@ class Deployed:
 
     def digest(self) -> str:
         """The SHA-256 of all that the policy and V are computed from, in hexadecimal digits."""
-        total = hashlib.sha256()
-        for name, array in sorted(self.solution.arrays().items()):
-            total.update(f"{name} {array.dtype} {array.shape}".encode())
-            total.update(np.ascontiguousarray(array).tobytes())
-        return total.hexdigest()
+        return digest(self.solution.arrays())
 
     def describe(self) -> dict[str, Any]:
         """The settings of the simulator."""
