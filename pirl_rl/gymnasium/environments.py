@@ -52,6 +52,11 @@ class ReachAvoidVectorGym(VectorEnv):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._state: TensorDictBase = TensorDict(batch_size=env.batch_size)
 
+    @property
+    def time_and_state(self) -> tuple[Tensor, Tensor]:
+        """The times to go (N,), in s, and the states (N, n) of the paths, in SI units."""
+        return self._state["tau"].squeeze(-1), self._state["state"]
+
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
