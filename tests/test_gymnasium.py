@@ -87,7 +87,8 @@ def test_a_problem_with_other_arguments_takes_the_place_of_the_registered_one():
 @pytest.fixture(scope="module")
 def exit_filter() -> ReachAvoidFilter:
     """A filter by the grid's solution of the exit from an interval, whose best control is 1."""
-    return ReachAvoidFilter(GridSolver(Exit1D(), 41).solve(), p=0.6, simulator=Simulator(Exit1D(), 0.1))
+    solution = GridSolver(Exit1D(), 41).solve()
+    return ReachAvoidFilter(solution, p=0.6, mode="least_restrictive", simulator=Simulator(Exit1D(), 0.1))
 
 
 def test_a_filter_corrects_the_actions_and_says_so(exit_filter):

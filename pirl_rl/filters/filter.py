@@ -20,14 +20,14 @@ from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 from pirl_rl.time_steps import propose_time_steps
 
-Mode = Literal["least_restrictive", "submartingale", "smallest_change"]
+Mode = Literal["submartingale", "least_restrictive", "smallest_change"]
 
 Rule = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 """Maps tau (N,), x (N, n) and nominal controls (N, m) to controls (N, m) and where they are others (N,)."""
 
 MODES: dict[str, Callable[[Solution, Simulator, float], Rule]] = {
-    "least_restrictive": LeastRestrictive,
     "submartingale": Submartingale,
+    "least_restrictive": LeastRestrictive,
     "smallest_change": lambda solution, simulator, p: SmallestChange(solution),
 }
 """The rules of the filter."""
@@ -44,8 +44,8 @@ class ReachAvoidFilter:
         nominal: maps tau (N,) in s and x (N, n) to controls (N, m) inside their box, in SI units, all of them tensors.
             It may be left out where only `correct` is called.
         p: the wanted probability of success, in (0, 1); "smallest_change" makes no use of it.
-        mode: "least_restrictive", see `LeastRestrictive`; "submartingale", see `Submartingale`, which bounds success on
-            whole paths; or "smallest_change", see `SmallestChange`.
+        mode: "submartingale", see `Submartingale`, which bounds success on whole paths; "least_restrictive", see
+            `LeastRestrictive`, which bounds it one step ahead; or "smallest_change", see `SmallestChange`.
         simulator: gives the control step; the default is that of the run, and for a solution a proposal of
             `pirl_rl.time_steps`.
         compile: whether calls with a single state are compiled, which takes up to a minute at the first of them. Where
@@ -60,7 +60,7 @@ class ReachAvoidFilter:
         run_or_solution: Any,
         nominal: Policy | None = None,
         p: float = 0.9,
-        mode: Mode = "least_restrictive",
+        mode: Mode = "submartingale",
         *,
         simulator: Simulator | None = None,
         compile: bool = False,

@@ -24,8 +24,8 @@ class Submartingale:
     Jensen's inequality, and that growth is what a nominal control may spend. In both cases V^k is a submartingale. At
     the end of a path it is 1 after success and 0 otherwise, so that the path succeeds with probability V(tau, x)^k or
     more, whatever the nominal controller does. The exponent k is such that this is p at V = p + min(0.05, (1 - p)/2).
-    It is a condition of the kind of stochastic control barrier functions (A. Clark, Automatica 130, 2021), with the
-    learned V as the barrier function.
+    Barrier functions bound the risk of stochastic systems within a finite time by conditions of this kind (C. Santoyo,
+    M. Dutreix and S. Coogan, Automatica 125, 2021).
 
     Args:
         solution: the learned value and policy.
