@@ -140,7 +140,7 @@ def ahead(run: Run, p: float) -> None:
     kicks = torch.einsum("inw,sw->sin", sigma, torch.special.ndtri(draws)) * h.sqrt()[:, None]
     points = problem.states.wrap(simulator.flow(x, u, h) + kicks)
     values = solution.value((tau - h).expand(SAMPLE, -1).flatten(), points.flatten(0, 1)).reshape(SAMPLE, -1)
-    for name, rule in (("flow and Ito correction", corrected), ("cubature", cubature)):
+    for name, rule in (("flow and Itô correction", corrected), ("cubature", cubature)):
         error = (rule(slice(None)) - values.mean(0)).abs()
         spent = microseconds(lambda i, rule=rule: rule(slice(i % 100, i % 100 + 1)))
         print(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from functools import cache
 from numbers import Integral
 from typing import Any
 
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.sets import Box
 
 Policy = Callable[[Tensor, Tensor], Tensor]
 """Maps tau (N,) in s and x (N, n) to the control (N, m), both in SI units."""
@@ -58,11 +60,17 @@ def checked_points(
         raise ArgumentError(message) from None
     if not bool(((times >= 0) & (times <= horizon * (1 + ROUNDING))).all()):
         raise ArgumentError(f"tau: expected 0 <= tau <= horizon = {horizon} s, got {tau}")
-    far = ~problem.states.expand(FAR).contains(state)
+    far = ~_far_box(problem.states).contains(state)
     if bool(far.any()):
         message = f"x: {int(far.sum())} of {far.numel()} states lie far outside the box of states {problem.states}"
         warnings.warn(f"{message}; nothing is learned there", stacklevel=3)
     return times, state
+
+
+@cache
+def _far_box(states: Box) -> Box:
+    """The box outside which a state is far; making it for every call would take longer than the rest of the check."""
+    return states.expand(FAR)
 
 
 def points_and_answer(

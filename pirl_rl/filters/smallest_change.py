@@ -26,7 +26,8 @@ class SmallestChange:
     derivatives are exact. It is the filter of control barrier functions (A. D. Ames, X. Xu, J. W. Grizzle and P.
     Tabuada, IEEE Transactions on Automatic Control 62, 2017) with V as the barrier function and without a decay. Where
     no control meets it, the one with the largest L^u V is taken. Since the exact V has sup_u L^u V = 0, Eq. (hjb_pde),
-    it leaves no freedom where V depends on the control.
+    it leaves no freedom where V depends on the control. Its promise rests on the derivatives of V, whose errors it
+    follows along the edge of the condition; `Submartingale` needs the values of V alone.
 
     Args:
         solution: the learned value.
