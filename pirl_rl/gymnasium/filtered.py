@@ -37,6 +37,7 @@ class FilteredGym(gymnasium.Wrapper):
         _expect_same_problem(self._paths, reach_avoid_filter)
 
     def step(self, action: Array) -> tuple[Array, Any, bool, bool, dict[str, Any]]:
+        """Play the corrected action in place of the given one (m,)."""
         corrected, intervened = _corrected(self._paths, self._filter, np.asarray(action)[None])
         seen, reward, terminated, truncated, info = self.env.step(corrected[0])
         return seen, reward, terminated, truncated, {**info, "intervened": bool(intervened[0]), "action": corrected[0]}
@@ -61,6 +62,7 @@ class FilteredVectorGym(VectorWrapper):
         _expect_same_problem(self._paths, reach_avoid_filter)
 
     def step(self, actions: Array) -> tuple[Array, NDArray, NDArray, NDArray, dict[str, Any]]:
+        """Play the corrected actions in place of the given ones (N, m)."""
         corrected, intervened = _corrected(self._paths, self._filter, np.asarray(actions))
         seen, reward, ended, cut, infos = self.env.step(corrected)
         # The library marks by a name with an underscore which paths an entry belongs to.
