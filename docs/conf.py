@@ -206,6 +206,20 @@ reference_rooms = {
             "pirl_rl.deployment.description",
         ],
     ),
+    "filters": (
+        "Filters and Gymnasium",
+        [
+            "pirl_rl.filters.filter",
+            "pirl_rl.filters.least_restrictive",
+            "pirl_rl.filters.submartingale",
+            "pirl_rl.filters.smallest_change",
+            "pirl_rl.filters.step_ahead",
+            "pirl_rl.gymnasium",
+            "pirl_rl.gymnasium.environments",
+            "pirl_rl.gymnasium.registration",
+            "pirl_rl.gymnasium.filtered",
+        ],
+    ),
     "figures": (
         "Figures",
         [

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pirl_rl import problems as problems
     from pirl_rl.api import check, evaluate, load_run, monte_carlo, train
+    from pirl_rl.filters import ReachAvoidFilter
     from pirl_rl.losses import PIRLLoss
     from pirl_rl.operators import generator
     from pirl_rl.problem import ReachAvoidProblem
@@ -22,6 +23,7 @@ __all__ = [
     "Box",
     "PIRLLoss",
     "Plane",
+    "ReachAvoidFilter",
     "ReachAvoidProblem",
     "Run",
     "Simulator",
@@ -45,6 +47,7 @@ _MODULE_OF = {
     **dict.fromkeys(("Box", "Plane", "band", "complement", "difference", "intersection", "union"), "pirl_rl.sets"),
     "PIRLLoss": "pirl_rl.losses",
     "generator": "pirl_rl.operators",
+    "ReachAvoidFilter": "pirl_rl.filters",
     "ReachAvoidProblem": "pirl_rl.problem",
     "Run": "pirl_rl.runs.run",
     "Simulator": "pirl_rl.simulator",

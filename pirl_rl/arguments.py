@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from functools import cache
 from numbers import Integral
 from typing import Any
 
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.sets import Box
 
 Policy = Callable[[Tensor, Tensor], Tensor]
 """Maps tau (N,) in s and x (N, n) to the control (N, m), both in SI units."""
@@ -58,40 +60,56 @@ def checked_points(
         raise ArgumentError(message) from None
     if not bool(((times >= 0) & (times <= horizon * (1 + ROUNDING))).all()):
         raise ArgumentError(f"tau: expected 0 <= tau <= horizon = {horizon} s, got {tau}")
-    far = ~problem.states.expand(FAR).contains(state)
+    far = ~_far_box(problem.states).contains(state)
     if bool(far.any()):
         message = f"x: {int(far.sum())} of {far.numel()} states lie far outside the box of states {problem.states}"
         warnings.warn(f"{message}; nothing is learned there", stacklevel=3)
     return times, state
 
 
-def checked_policy(policy: Policy, problem: ReachAvoidProblem) -> Policy:
+@cache
+def _far_box(states: Box) -> Box:
+    """The box outside which a state is far; making it for every call would take longer than the rest of the check."""
+    return states.expand(FAR)
+
+
+def points_and_answer(
+    problem: ReachAvoidProblem, tau: Any, x: Any, dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor, Callable[[Tensor], Any]]:
+    """The results of `checked_points`, and a function that converts results to the kind of x, numpy or torch."""
+    times, state = checked_points(problem, tau, x, dtype, device)
+    if isinstance(x, Tensor):
+        return times, state, lambda answer: answer.to(x.device)
+    return times, state, lambda answer: np.asarray(answer.cpu())
+
+
+def checked_policy(policy: Policy, problem: ReachAvoidProblem, name: str = "policy") -> Policy:
     """The policy, whose controls are checked at every call.
 
     The function that is returned raises an ArgumentError where the controls have another shape than (N, m), are not
-    finite, or lie outside `problem.controls`.
+    finite, or lie outside `problem.controls`; it starts with `name`.
 
     Raises:
         ArgumentError: the policy is no function.
     """
     if not callable(policy):
-        raise ArgumentError(f"policy: expected a function of tau and x, got {policy!r}")
+        raise ArgumentError(f"{name}: expected a function of tau and x, got {policy!r}")
     allowed = problem.controls.expand(1 + CONTROL_ROUNDING)
 
     def checked(tau: Tensor, x: Tensor) -> Tensor:
         control = policy(tau, x)
         if not isinstance(control, Tensor):
-            raise ArgumentError(f"policy: expected controls as a tensor, got {type(control).__name__}")
+            raise ArgumentError(f"{name}: expected controls as a tensor, got {type(control).__name__}")
         expected = (len(x), problem.controls.dim)
         if control.shape != expected:
             raise ArgumentError(
-                f"policy: expected controls of shape {expected} for {len(x)} states, got {tuple(control.shape)}"
+                f"{name}: expected controls of shape {expected} for {len(x)} states, got {tuple(control.shape)}"
             )
         bad = ~(control.isfinite().all(-1) & allowed.contains(control))
         if bool(bad.any()):
             first = int(bad.nonzero()[0])
             raise ArgumentError(
-                f"policy: expected controls in {problem.controls}, got {control[first].tolist()} at "
+                f"{name}: expected controls in {problem.controls}, got {control[first].tolist()} at "
                 f"tau = {tau[first].item()} s, x = {x[first].tolist()}"
             )
         return control

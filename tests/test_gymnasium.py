@@ -1,4 +1,4 @@
-"""The Gymnasium view: the library's own checker, the same episodes as the environment, and seeds."""
+"""The Gymnasium view: the checker of the library, registered names, the episodes of the environment, and filters."""
 
 from __future__ import annotations
 
@@ -8,22 +8,130 @@ import numpy as np
 import pytest
 import torch
 
+import pirl_rl.problems
+from pirl_rl import ReachAvoidFilter
 from pirl_rl.envs import ReachAvoidEnv
+from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.monte_carlo import mean_payoff
-from pirl_rl.problems import DoubleIntegrator, DubinsCar, Reach1D
+from pirl_rl.grid import GridSolver
+from pirl_rl.problems import DubinsCar, Exit1D, HalfSpace, Reach1D
 from pirl_rl.simulator import Simulator
+from pirl_rl.time_steps import propose_time_steps
 
-env_checker = pytest.importorskip("gymnasium.utils.env_checker")
-from pirl_rl.gymnasium import ReachAvoidGym, ReachAvoidVectorGym, observation  # noqa: E402
+gymnasium = pytest.importorskip("gymnasium")
+from gymnasium.utils import env_checker  # noqa: E402
+
+from pirl_rl.gymnasium import (  # noqa: E402
+    FilteredGym,
+    FilteredVectorGym,
+    ReachAvoidGym,
+    ReachAvoidVectorGym,
+    observation,
+)
+
+SHIPPED = pirl_rl.problems.__all__
 
 
-@pytest.mark.parametrize("problem", [Reach1D(), DoubleIntegrator(), DubinsCar()])
-def test_the_checker_of_the_library_finds_no_fault(problem):
+def coarse(name: str) -> dict:
+    """Few time steps, which take less time to choose than those that are proposed."""
+    return {"dt": getattr(pirl_rl.problems, name).horizon / 10, "substeps": 1}
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_the_checker_of_the_library_finds_no_fault(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         # The state is not bounded, and the library would have it so.
         warnings.filterwarnings("ignore", message=".*Box observation space (minimum|maximum) value is -?infinity.*")
-        env_checker.check_env(ReachAvoidGym(problem, dt=problem.horizon / 10), skip_render_check=True)
+        env = gymnasium.make(f"pirl_rl/{name}-v0", **coarse(name)).unwrapped
+        assert isinstance(env, ReachAvoidGym)
+        env_checker.check_env(env, skip_render_check=True)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_vectors_keep_to_the_interface_of_the_library(name):
+    """The library has no checker of vectors: spaces, kinds of results, seeds, and a wrapper of its own are tested."""
+    pair = [gymnasium.make_vec(f"pirl_rl/{name}-v0", num_envs=6, **coarse(name)) for _ in range(2)]
+    recorded = gymnasium.wrappers.vector.RecordEpisodeStatistics(pair[0])
+    assert isinstance(pair[0].unwrapped, ReachAvoidVectorGym)
+    assert pair[0].num_envs == 6
+    assert pair[0].metadata["autoreset_mode"] == gymnasium.vector.AutoresetMode.SAME_STEP
+    first, other = (env.reset(seed=4)[0] for env in (recorded, pair[1]))
+    assert np.array_equal(first, other)
+    recorded.action_space.seed(0)
+    ends = 0
+    for _ in range(12):
+        actions = recorded.action_space.sample()
+        seen, reward, ended, cut, _ = recorded.step(actions)
+        assert np.array_equal(seen, pair[1].step(actions)[0])
+        assert recorded.observation_space.contains(seen)
+        assert (reward.shape, reward.dtype, ended.shape, ended.dtype, cut.any()) == ((6,), float, (6,), bool, False)
+        ends += ended.sum()
+    assert len(recorded.return_queue) == ends > 0
+
+
+def test_a_registered_environment_has_the_proposed_time_steps():
+    proposed = propose_time_steps(HalfSpace())
+    for env in (gymnasium.make("pirl_rl/HalfSpace-v0").unwrapped.paths, gymnasium.make_vec("pirl_rl/HalfSpace-v0", 2)):
+        simulator = env.unwrapped.env.simulator
+        assert (simulator.dt, simulator.substeps) == (proposed.dt, proposed.substeps)
+    finer = gymnasium.make("pirl_rl/HalfSpace-v0", substeps=8).unwrapped.paths.env.simulator
+    assert (finer.dt, finer.substeps) == (proposed.dt, 8)
+
+
+def test_a_problem_with_other_arguments_takes_the_place_of_the_registered_one():
+    env = gymnasium.make("pirl_rl/HalfSpace-v0", problem=HalfSpace(dim=5), dt=0.1, substeps=1)
+    assert env.action_space.shape == (5,)
+
+
+@pytest.fixture(scope="module")
+def exit_filter() -> ReachAvoidFilter:
+    """A filter by the grid's solution of the exit from an interval, whose best control is 1."""
+    solution = GridSolver(Exit1D(), 41).solve()
+    return ReachAvoidFilter(solution, p=0.6, mode="least_restrictive", simulator=Simulator(Exit1D(), 0.1))
+
+
+def test_a_filter_corrects_the_actions_and_says_so(exit_filter):
+    """The action -1 becomes 1 where the filter intervenes, for one path and for many alike."""
+    env = FilteredGym(gymnasium.make("pirl_rl/Exit1D-v0", dt=0.1, substeps=1), exit_filter)
+    env.reset(seed=1)
+    counts = {True: 0, False: 0}
+    for _ in range(60):
+        tau, x = env.unwrapped.paths.time_and_state
+        expected = bool(exit_filter.correct(tau, x, -torch.ones(1, 1))[1])
+        _, _, ended, _, info = env.step(np.array([-1.0], np.float32))
+        assert info["intervened"] is expected
+        assert info["action"] == pytest.approx([1.0 if expected else -1.0], abs=1e-6)
+        counts[expected] += 1
+        if ended:
+            env.reset()
+    assert min(counts.values()) > 3
+    paths = FilteredVectorGym(gymnasium.make_vec("pirl_rl/Exit1D-v0", 50, dt=0.1, substeps=1), exit_filter)
+    paths.reset(seed=2)
+    expected = exit_filter.correct(*paths.unwrapped.time_and_state, -torch.ones(50, 1))[1].numpy()
+    infos = paths.step(-np.ones((50, 1), np.float32))[-1]
+    assert np.array_equal(infos["intervened"], expected)
+    assert 0 < expected.sum() < 50
+    assert infos["action"][:, 0] == pytest.approx(np.where(expected, 1.0, -1.0), abs=1e-6)
+
+
+def test_a_filter_belongs_to_the_problem_of_its_environment(exit_filter):
+    with pytest.raises(ArgumentError, match="reach_avoid_filter: expected one of the problem Reach1D, got Exit1D"):
+        FilteredGym(ReachAvoidGym(Reach1D(), dt=0.1), exit_filter)
+    with pytest.raises(ArgumentError, match="env: expected a ReachAvoidGym, got a CartPoleEnv"):
+        FilteredGym(gymnasium.make("CartPole-v1"), exit_filter)
+
+
+def test_ppo_of_another_library_trains_on_a_registered_environment(exit_filter):
+    """A short rollout, without and with a filter; whether it learns is a test of the rivals."""
+    library = pytest.importorskip("stable_baselines3")
+    plain = gymnasium.make("pirl_rl/Exit1D-v0", dt=0.1, substeps=1)
+    for env in (plain, FilteredGym(plain, exit_filter)):
+        model = library.PPO("MlpPolicy", env, n_steps=64, batch_size=32, n_epochs=1, seed=0, device="cpu")
+        before = [entry.clone() for entry in model.policy.parameters()]
+        model.learn(64)
+        assert model.num_timesteps == 64
+        assert any(not torch.equal(old, new) for old, new in zip(before, model.policy.parameters(), strict=True))
 
 
 def test_an_observation_is_scaled_and_angles_are_periodic():

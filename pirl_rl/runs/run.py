@@ -7,12 +7,11 @@ from collections.abc import Callable, Sequence
 from numbers import Real
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from pirl_rl.arguments import checked_points, seeded
+from pirl_rl.arguments import checked_points, points_and_answer, seeded
 from pirl_rl.ascent import look_ahead_policy
 from pirl_rl.assembly import make_evaluation_simulator, make_simulator, make_starts
 from pirl_rl.certificates import Certificate, Deployed, LawOfStarts, OneStart, certify, make_certifiers
@@ -238,10 +237,7 @@ class Run:
 
     def _arguments(self, tau, x) -> tuple[Tensor, Tensor, Callable[[Tensor], Any]]:
         """tau (*) and x (*, n) in the networks' dtype, and a function that converts results to the kind of x."""
-        times, state = checked_points(self.problem, tau, x, self.solution.dtype, self.solution.device)
-        if isinstance(x, Tensor):
-            return times, state, lambda answer: answer.to(x.device)
-        return times, state, lambda answer: np.asarray(answer.cpu())
+        return points_and_answer(self.problem, tau, x, self.solution.dtype, self.solution.device)
 
 
 def _changed(simulator: Simulator, dt: float | None, substeps: int | None, crossing: Crossing | None) -> Simulator:

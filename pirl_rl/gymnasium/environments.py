@@ -52,9 +52,15 @@ class ReachAvoidVectorGym(VectorEnv):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._state: TensorDictBase = TensorDict(batch_size=env.batch_size)
 
+    @property
+    def time_and_state(self) -> tuple[Tensor, Tensor]:
+        """The times to go (N,), in s, and the states (N, n) of the paths, in SI units."""
+        return self._state["tau"].squeeze(-1), self._state["state"]
+
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
+        """Start all episodes anew; a seed that is one number fixes them and all that follow, others are not used."""
         super().reset(seed=seed if isinstance(seed, int) else None)
         if isinstance(seed, int):
             self.env.set_seed(seed)
@@ -90,10 +96,12 @@ class ReachAvoidGym(gymnasium.Env[Array, Array]):
         self.action_space = self.paths.single_action_space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+        """Start an episode; a seed fixes it and all that follow."""
         super().reset(seed=seed)
         return self.paths.reset(seed=seed)[0][0], {}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Advance the path by one control step: observation, reward, end, False, no information."""
         after, reward, ended, _, infos = self.paths.step(np.asarray(action)[None])
         last = infos["final_obs"] if ended[0] else after
         return last[0], float(reward[0]), bool(ended[0]), False, {}
