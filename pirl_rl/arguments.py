@@ -117,6 +117,16 @@ def checked_policy(policy: Policy, problem: ReachAvoidProblem, name: str = "poli
     return checked
 
 
+def check_integer(name: str, value: int, least: int) -> None:
+    """Refuse what is no integer, or one that is too small.
+
+    Raises:
+        ArgumentError: with the name of the argument.
+    """
+    if isinstance(value, bool) or not (isinstance(value, int) and value >= least):
+        raise ArgumentError(f"{name}: expected an integer >= {least}, got {value!r}")
+
+
 def seeded(seed: int, device: torch.device) -> torch.Generator:
     """A random generator with a seed.
 

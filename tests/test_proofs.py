@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import numpy as np
@@ -10,7 +11,10 @@ import torch
 from scipy.interpolate import NdBSpline
 from torch import nn
 
+from pirl_rl import certify, load_run
+from pirl_rl.certificates import Deployed
 from pirl_rl.errors import ProofError
+from pirl_rl.grid import GridSolver
 from pirl_rl.networks import Actor
 from pirl_rl.problems import DoubleIntegrator, DubinsCar, Exit1D, HalfSpace, Pendulum, Reach1D, Safety1D, ZermeloBoat
 from pirl_rl.proofs import Settings, prove_success
@@ -220,8 +224,48 @@ def test_problems_beyond_the_method_are_refused(problem, message):
         prove_success(Stand(problem, constant(1.0)), "none")
 
 
+def test_a_grid_has_no_network_to_prove():
+    with pytest.raises(ProofError, match="expected a policy that is a network, got that of a grid"):
+        prove_success(GridSolver(Reach1D(), 11, estimate=False).solve(), "none")
+
+
 def test_a_side_in_the_target_is_moved_outward():
     mesh = mesh_of(Exit1D(), 10, 10)
     assert mesh.beyond == [(False, True)]
     assert mesh.edges[1][0] == -1
     assert mesh.edges[1][-1] == pytest.approx(1.1)
+
+
+def test_the_command_writes_a_proof(trained, in_process):
+    """The bound of the file is that of the printed lines, and belongs to the networks of the run."""
+    code, text = in_process(certify)(f"run={trained}", "method=interval", "cells=40", "steps=40")
+    assert code == 0, text
+    found = json.loads((trained / "proof.json").read_text())
+    assert found["holds"], found
+    assert f"at least {found['best']:.4f}" in text
+    run = load_run(trained)
+    assert found["networks"] == Deployed(run.solution, run.simulator).digest()
+    arrays = np.load(trained / "proof.npz")
+    spline = Spline([arrays["edges_0"], arrays["edges_1"]], arrays["coefficients"])
+    best = spline(np.array([[run.problem.horizon, *found["best_state"]]])) - arrays["margin"]
+    assert best[0] == pytest.approx(found["best"])
+    code, text = in_process(certify)(f"run={trained}", "method=interval", "cells=10", "rounds=1", "halvings=0")
+    assert code == 0
+    assert "Nothing is proved: some conditions resist." in text
+    assert not json.loads((trained / "proof.json").read_text())["holds"]
+    assert not (trained / "proof.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["method=intervall"], "method: expected statistical or interval, got 'intervall'"),
+        (["method=interval", "episodes=5"], "episodes=5: expected key=value with a key out of cells, halvings"),
+        (["method=interval", "cells=0"], "cells: expected an integer >= 8, got 0"),
+    ],
+)
+def test_a_wrong_command_is_one_sentence(arguments, message, trained, in_process):
+    code, text = in_process(certify)(f"run={trained}", *arguments)
+    assert code == 1
+    assert "Traceback" not in text
+    assert message in text

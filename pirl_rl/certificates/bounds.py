@@ -76,16 +76,6 @@ def _checked(successes: ArrayLike, trials: int, confidence: float) -> np.ndarray
     return count
 
 
-def check_integer(name: str, value: int, least: int) -> None:
-    """Refuse what is no integer, or one that is too small.
-
-    Raises:
-        ArgumentError: with the name of the argument.
-    """
-    if isinstance(value, bool) or not (isinstance(value, int) and value >= least):
-        raise ArgumentError(f"{name}: expected an integer >= {least}, got {value!r}")
-
-
 def check_level(name: str, value: float) -> None:
     """Refuse a level or a share that is not between 0 and 1.
 

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from pirl_rl.arguments import check_integer
 from pirl_rl.certificates.band import ValueBand
-from pirl_rl.certificates.bounds import check_integer, check_level
+from pirl_rl.certificates.bounds import check_level
 from pirl_rl.certificates.claim import Certifier, Claim, Level
 from pirl_rl.certificates.deployed import Deployed, Rngs, Starts
 from pirl_rl.certificates.success import SuccessBound

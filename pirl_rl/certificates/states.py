@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pirl_rl.certificates.bounds import check_integer, check_level, lower_bound, upper_bound
+from pirl_rl.arguments import check_integer
+from pirl_rl.certificates.bounds import check_level, lower_bound, upper_bound
 from pirl_rl.certificates.deployed import Deployed, OneStart, Rngs, Starts
 from pirl_rl.errors import ArgumentError
 

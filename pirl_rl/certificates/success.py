@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from pirl_rl.certificates.bounds import check_integer, check_level, lower_bound, mean_margin
+from pirl_rl.arguments import check_integer
+from pirl_rl.certificates.bounds import check_level, lower_bound, mean_margin
 from pirl_rl.certificates.claim import Claim, Level
 from pirl_rl.certificates.deployed import Deployed, Rngs, Starts
 from pirl_rl.certificates.sequence import anytime_lower_bound, anytime_upper_bound

@@ -105,6 +105,7 @@ def _prove(run: Run, directory: RunDirectory, settings: dict[str, Any]) -> list[
     found = proof.to_dict(run.problem)
     with replacing(directory.proof) as file:
         file.write(json.dumps(found, indent=2) + "\n")
+    directory.bound.unlink(missing_ok=True)  # that of an earlier proof
     if not proof.holds:
         resist = [f"unproved  {name}, on {len(boxes):,} boxes" for name, boxes in proof.unproved.items()]
         return ["Nothing is proved: some conditions resist.", *resist, f"written   {directory.proof}"]

@@ -14,6 +14,7 @@ import torch
 from scipy.ndimage import maximum_filter
 from torch import Tensor
 
+from pirl_rl.arguments import check_integer
 from pirl_rl.errors import ProofError
 from pirl_rl.files import replacing
 from pirl_rl.problem import ReachAvoidProblem
@@ -56,12 +57,19 @@ class Settings:
         steps: the number of cells along tau.
         rounds: the number of times that W is fitted again.
         halvings: the number of times that a box may be halved.
+
+    Raises:
+        ArgumentError: a number is too small.
     """
 
     cells: int = 80
     steps: int = 80
     rounds: int = 20
     halvings: int = 8
+
+    def __post_init__(self):
+        for name, least in (("cells", 8), ("steps", 8), ("rounds", 1), ("halvings", 0)):
+            check_integer(name, getattr(self, name), least)
 
 
 @dataclass(frozen=True)
@@ -143,9 +151,11 @@ def prove_success(solution: Solution, networks: str, settings: Settings | None =
         settings: the effort.
 
     Raises:
-        ProofError: there are too many states, periodic ones, or a function that has no enclosure.
+        ProofError: there are no networks, too many states or periodic ones, or a function has no enclosure.
     """
     problem, settings = solution.problem, settings or Settings()
+    if not hasattr(solution, "actor"):
+        raise ProofError("proof: expected a policy that is a network, got that of a grid")
     if problem.states.dim > MOST_STATES:
         raise ProofError(f"proof: expected at most {MOST_STATES} states, got {problem.states.dim}")
     if problem.states.periodic:
