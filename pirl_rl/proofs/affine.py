@@ -30,6 +30,9 @@ ROUNDING = 2.0**-52
 
 Number = float | int | Tensor
 
+FUNCTIONS: dict[str, Callable[..., Any]] = {}
+"""The enclosures of torch's functions by their names, with torch's arguments; see `functions` and `structure`."""
+
 
 class Affine:
     """Affine forms of shape (N, *), one for each of N boxes and each entry.
@@ -50,9 +53,16 @@ class Affine:
         return cls(centre, slopes, ROUNDING * (centre.abs() + half_width))
 
     @classmethod
-    def of_constant(cls, value: Tensor, like: Affine) -> Affine:
-        """Forms with an exact value that broadcasts to (N, *)."""
-        value = value.to(torch.float64)
+    def of(cls, value: Affine | Number, like: Affine) -> Affine:
+        """The value itself if it is a form; else forms with this exact value, which broadcasts to (N, *).
+
+        Args:
+            value: a form, a number, or a tensor.
+            like: forms of the same boxes.
+        """
+        if isinstance(value, Affine):
+            return value
+        value = torch.as_tensor(value, dtype=torch.float64)
         return cls(value, value.new_zeros((len(like.slopes), *value.shape)), torch.zeros_like(value))
 
     # Bounds
@@ -120,8 +130,6 @@ class Affine:
 
     @classmethod
     def __torch_function__(cls, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Any = None) -> Any:
-        from pirl_rl.proofs.functions import FUNCTIONS
-
         name = getattr(func, "__name__", str(func)).strip("_")
         if name not in FUNCTIONS:
             raise ProofError(f"torch.{name}: no enclosure of this function is known, so that nothing can be proved")
@@ -130,8 +138,7 @@ class Affine:
     # Arithmetic
 
     def _plus(self, other: Affine | Number, sign: float) -> Affine:
-        if not isinstance(other, Affine):
-            other = Affine.of_constant(torch.as_tensor(other, dtype=torch.float64), self)
+        other = Affine.of(other, self)
         centre = self.centre + sign * other.centre
         own, others = torch.broadcast_tensors(_padded(self.slopes, centre.ndim), _padded(other.slopes, centre.ndim))
         slopes = own + sign * others
@@ -210,8 +217,7 @@ class Affine:
 
     def where(self, condition: Tensor, other: Affine | Number) -> Affine:
         """These forms where the condition holds, and the others elsewhere."""
-        if not isinstance(other, Affine):
-            other = Affine.of_constant(torch.as_tensor(other, dtype=torch.float64), self)
+        other = Affine.of(other, self)
         parts = ((self.centre, other.centre), (self.slopes, other.slopes), (self.radius, other.radius))
         return Affine(*(torch.where(condition, a, b) for a, b in parts))
 
@@ -236,5 +242,5 @@ class Affine:
 
 
 def _padded(slopes: Tensor, ndim: int) -> Tensor:
-    """Slopes (d, N, *) with axes of length 1 after the first, so that they broadcast like forms of `ndim` axes."""
+    """Slopes (d, N, *) with axes of length 1 after the first, so that they broadcast like forms with `ndim` axes."""
     return slopes.reshape(len(slopes), *[1] * (ndim + 1 - slopes.ndim), *slopes.shape[1:])

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.ndimage import maximum_filter
 from torch import Tensor
 
 from pirl_rl.proofs.affine import Affine
@@ -34,11 +36,28 @@ class Boxes:
         zeros = torch.zeros(numbers.shape, dtype=torch.float64)
         return cls(edges, numbers, zeros, torch.ones_like(zeros))
 
+    @classmethod
+    def join(cls, parts: Sequence[Boxes]) -> Boxes:
+        """The boxes of all parts, which have the same edges."""
+        rows = [(part.cell, part.place, part.share) for part in parts]
+        return cls(parts[0].edges, *(torch.cat(entry) for entry in zip(*rows, strict=True)))
+
     def __len__(self) -> int:
         return len(self.cell)
 
     def __getitem__(self, index) -> Boxes:
         return Boxes(self.edges, self.cell[index], self.place[index], self.share[index])
+
+    def around(self, others: Boxes) -> Boxes:
+        """Those boxes whose cells contain one of the other boxes, or are next to such a cell."""
+        marked = np.zeros([len(axis) - 1 for axis in self.edges], bool)
+        marked[tuple(others.cell.T.numpy())] = True
+        marked = maximum_filter(marked, size=3)
+        return self[torch.from_numpy(marked[tuple(self.cell.T.numpy())])]
+
+    def split(self, size: int) -> list[Boxes]:
+        """Parts of at most `size` boxes."""
+        return [self[slice(start, start + size)] for start in range(0, len(self), size)]
 
     def _ends(self) -> tuple[Tensor, Tensor]:
         low, high = [], []
@@ -80,4 +99,4 @@ class Boxes:
         chosen = torch.nn.functional.one_hot(axis, self.cell.shape[-1]).double()
         share = self.share * (1 - chosen / 2)
         parts = [Boxes(self.edges, self.cell, self.place + sign * chosen * share, share) for sign in (-1, 1)]
-        return Boxes(self.edges, *(torch.cat([getattr(p, name) for p in parts]) for name in ("cell", "place", "share")))
+        return Boxes.join(parts)

@@ -1,16 +1,17 @@
-"""Enclosures of torch's functions, by their names."""
+"""Enclosures of the functions of torch that compute."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from pirl_rl.errors import ProofError
-from pirl_rl.proofs.affine import Affine, Number
+from pirl_rl.proofs.affine import FUNCTIONS, Affine, Number
+from pirl_rl.proofs.structure import unbind, unsqueeze
 
 LEAST = 1e-12
 """An argument of a root, a logarithm or a reciprocal must be above this in the whole box."""
@@ -132,11 +133,11 @@ def _abs(z: Affine) -> Affine:
 
 
 def _maximum(a: Affine | Tensor, b: Affine | Tensor) -> Affine:
-    return (a + b + _abs(_form(a, b) - b)) * 0.5  # type: ignore[operator]
+    return (a + b + _abs(Affine.of(a, b) - b)) * 0.5  # type: ignore[operator]
 
 
 def _minimum(a: Affine | Tensor, b: Affine | Tensor) -> Affine:
-    return (a + b - _abs(_form(a, b) - b)) * 0.5  # type: ignore[operator]
+    return (a + b - _abs(Affine.of(a, b) - b)) * 0.5  # type: ignore[operator]
 
 
 def _clamp(z: Affine, min: Number | None = None, max: Number | None = None) -> Affine:
@@ -147,77 +148,24 @@ def _clamp(z: Affine, min: Number | None = None, max: Number | None = None) -> A
 
 def _extreme(pairwise: Callable[[Affine, Affine], Affine]) -> Callable[..., Affine]:
     def reduced(z: Affine, dim: int = -1, keepdim: bool = False) -> Affine:
-        result, *others = _unbind(z, dim)
+        result, *others = unbind(z, dim)
         for other in others:
             result = pairwise(result, other)
-        return _unsqueeze(result, dim) if keepdim else result
+        return unsqueeze(result, dim) if keepdim else result
 
     return reduced
 
 
 def _norm(z: Affine, p: Any = None, dim: Any = -1, keepdim: bool = False, **_: Any) -> Affine:
     """The Euclidean norm; where it can be 0 in a box, an interval."""
+    if p not in (None, 2, "fro"):
+        raise ProofError(f"norm: expected the Euclidean norm, p = 2, got p = {p!r}")
     squares = _square(z).sum(dim if isinstance(dim, int) else dim[0], keepdim=keepdim)
     low, high = squares.low.clamp(min=0).sqrt(), squares.high.clamp(min=0).sqrt()
     interval = Affine((low + high) / 2, torch.zeros_like(squares.slopes), (high - low) / 2 + 1e-15 * high)
     safe = squares.low > LEAST
     shifted = squares.where(safe, torch.ones_like(squares.centre))
     return _sqrt(shifted).where(safe, interval)
-
-
-def _form(value: Affine | Tensor | float, like: Any) -> Affine:
-    if isinstance(value, Affine):
-        return value
-    return Affine.of_constant(torch.as_tensor(value, dtype=torch.float64), like)
-
-
-def _join(join: Callable[..., Tensor]) -> Callable[..., Affine]:
-    def joined(parts: Sequence[Affine | Tensor], dim: int = 0) -> Affine:
-        like = next(part for part in parts if isinstance(part, Affine))
-        forms = [_form(part, like) for part in parts]
-        ndim = like.ndim + (join is torch.stack)
-        dim = dim if dim < 0 else dim - ndim
-        shape = like.shape if join is torch.stack else None
-        entries = [(form.centre, form.slopes, form.radius) for form in forms]
-        if shape is not None:
-            entries = [(c.expand(shape), s.expand(len(s), *shape), r.expand(shape)) for c, s, r in entries]
-        return Affine(*(join(part, dim) for part in zip(*entries, strict=True)))
-
-    return joined
-
-
-def _unbind(z: Affine, dim: int = 0) -> list[Affine]:
-    dim = dim if dim < 0 else dim - z.ndim
-    return [Affine(*parts) for parts in zip(*(e.unbind(dim) for e in (z.centre, z.slopes, z.radius)), strict=True)]
-
-
-def _unsqueeze(z: Affine, dim: int) -> Affine:
-    dim = dim if dim < 0 else dim - z.ndim - 1
-    return Affine(*(entry.unsqueeze(dim) for entry in (z.centre, z.slopes, z.radius)))
-
-
-def _expand(z: Affine, *shape: Any) -> Affine:
-    sizes = tuple(shape[0]) if len(shape) == 1 and isinstance(shape[0], (tuple, list, torch.Size)) else shape
-    return Affine(z.centre.expand(sizes), z.slopes.expand(len(z.slopes), *sizes), z.radius.expand(sizes))
-
-
-def _where(condition: Tensor, a: Affine | Tensor, b: Affine | Tensor) -> Affine:
-    if isinstance(condition, Affine):
-        raise ProofError("torch.where: expected a condition that does not depend on the state")
-    return _form(a, b).where(condition, b)
-
-
-def _like(make: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    return lambda z, **_: make(z.centre)
-
-
-def _filled(z: Affine, value: float, **_: Any) -> Tensor:
-    return torch.full_like(z.centre, value)
-
-
-def _to(value: Any, *_: Any, **__: Any) -> Any:
-    """Forms are double precision on the CPU; a tensor that is moved to the kind of a form becomes that too."""
-    return value if isinstance(value, Affine) else value.to("cpu", torch.float64)
 
 
 def _distances(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
@@ -235,51 +183,39 @@ def _constant(bound: float) -> Callable[[Tensor, Tensor], Tensor]:
     return lambda low, high: torch.full_like(low, bound)
 
 
-FUNCTIONS: dict[str, Callable[..., Any]] = {
-    "add": lambda a, b: _form(a, b) + b,
-    "sub": lambda a, b: _form(a, b) - b,
-    "rsub": lambda a, b: _form(b, a) - a,
-    "mul": lambda a, b: _form(a, b) * b,
-    "div": lambda a, b: _form(a, b) / b,
-    "truediv": lambda a, b: _form(a, b) / b,
-    "neg": lambda a: -a,
-    "pow": lambda a, b: a ** (int(b) if b == int(b) else b),
-    "square": _square,
-    "reciprocal": _reciprocal,
-    "abs": _abs,
-    "sqrt": _sqrt,
-    "exp": _exp,
-    "log": _log,
-    "sin": _sin,
-    "cos": _cos,
-    "tan": _tan,
-    "atan": _atan,
-    "tanh": _tanh,
-    "sigmoid": _sigmoid,
-    "silu": lambda z, inplace=False: _silu(z),
-    "softplus": _softplus,
-    "relu": lambda z, inplace=False: _clamp(z, min=0.0),
-    "maximum": _maximum,
-    "minimum": _minimum,
-    "clamp": _clamp,
-    "amax": _extreme(_maximum),
-    "amin": _extreme(_minimum),
-    "norm": _norm,
-    "vector_norm": _norm,
-    "sum": lambda z, dim=-1, keepdim=False: z.sum(dim, keepdim),
-    "matmul": lambda a, b: a.matmul(b),
-    "cat": _join(torch.cat),
-    "concat": _join(torch.cat),
-    "stack": _join(torch.stack),
-    "unbind": _unbind,
-    "unsqueeze": _unsqueeze,
-    "squeeze": lambda z, dim: z.map(lambda entry: entry.squeeze(dim)),
-    "expand": _expand,
-    "clone": lambda z: z,
-    "where": _where,
-    "to": _to,
-    "ones_like": _like(torch.ones_like),
-    "zeros_like": _like(torch.zeros_like),
-    "full_like": _filled,
-}
-"""The enclosure of each function, with the arguments of torch's."""
+FUNCTIONS.update(
+    {
+        "add": lambda a, b: Affine.of(a, b) + b,
+        "sub": lambda a, b: Affine.of(a, b) - b,
+        "rsub": lambda a, b: Affine.of(b, a) - a,
+        "mul": lambda a, b: Affine.of(a, b) * b,
+        "div": lambda a, b: Affine.of(a, b) / b,
+        "truediv": lambda a, b: Affine.of(a, b) / b,
+        "neg": lambda a: -a,
+        "pow": lambda a, b: a ** (int(b) if b == int(b) else b),
+        "square": _square,
+        "reciprocal": _reciprocal,
+        "abs": _abs,
+        "sqrt": _sqrt,
+        "exp": _exp,
+        "log": _log,
+        "sin": _sin,
+        "cos": _cos,
+        "tan": _tan,
+        "atan": _atan,
+        "tanh": _tanh,
+        "sigmoid": _sigmoid,
+        "silu": lambda z, inplace=False: _silu(z),
+        "softplus": _softplus,
+        "relu": lambda z, inplace=False: _clamp(z, min=0.0),
+        "maximum": _maximum,
+        "minimum": _minimum,
+        "clamp": _clamp,
+        "amax": _extreme(_maximum),
+        "amin": _extreme(_minimum),
+        "norm": _norm,
+        "vector_norm": _norm,
+        "sum": lambda z, dim=-1, keepdim=False: z.sum(dim, keepdim),
+        "matmul": lambda a, b: a.matmul(b),
+    }
+)

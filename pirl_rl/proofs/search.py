@@ -10,18 +10,25 @@ from torch import Tensor
 
 from pirl_rl.proofs.boxes import Boxes
 
-CHUNK = 20_000
+CHUNK = 8_192
 """The number of boxes that are bounded at once."""
 
 Check = Callable[[Boxes], tuple[Tensor, Tensor]]
-"""Whether a condition is proved on each of N boxes (N,), and the axis (N,) along which to halve the others."""
+"""The margin (N,) with which a condition holds on each of N boxes, and the axis (N,) along which to halve it."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The boxes on which a condition was not proved, and the number of boxes that were bounded."""
+    """What is known of a condition.
+
+    Attributes:
+        left: the boxes on which it was not proved with the wanted margin.
+        margin: that with which it holds everywhere.
+        bounded: the number of boxes that were bounded.
+    """
 
     left: Boxes
+    margin: float
     bounded: int
 
     @property
@@ -29,27 +36,28 @@ class Outcome:
         return not len(self.left)
 
 
-def prove(check: Check, boxes: Boxes, halvings: int) -> Outcome:
+def prove(check: Check, boxes: Boxes, margin: float, halvings: int) -> Outcome:
     """Prove a condition on boxes, by halving those on which it is not proved.
 
     Args:
-        check: bounds the condition on boxes.
+        check: bounds the margin with which the condition holds.
         boxes: the boxes to begin with.
+        margin: the wanted margin.
         halvings: the number of times that a box may be halved.
     """
     bounded = 0
-    for _ in range(halvings + 1):
-        undecided = []
-        for start in range(0, len(boxes), CHUNK):
-            part = boxes[slice(start, start + CHUNK)]
-            proved, axis = check(part)
-            undecided.append((part[~proved], axis[~proved]))
-            bounded += len(part)
-        left = Boxes(boxes.edges, *(torch.cat([getattr(part, name) for part, _ in undecided]) for name in NAMES))
-        if not len(left):
-            return Outcome(left, bounded)
-        boxes = left.halves(torch.cat([axis for _, axis in undecided]))
-    return Outcome(left, bounded)
-
-
-NAMES = ("cell", "place", "share")
+    for number in range(halvings + 1):
+        left, axes, needed = [boxes[:0]], [torch.zeros(0, dtype=torch.long)], margin
+        for part in boxes.split(CHUNK):
+            margins, axis = check(part)
+            margins = margins.nan_to_num(nan=torch.inf)  # what cannot be computed is not proved
+            resists = margins > margin
+            left.append(part[resists])
+            axes.append(axis[resists])
+            needed = max(needed, margins.max().item())
+        bounded += len(boxes)
+        boxes = Boxes.join(left)
+        if not len(boxes) or number == halvings:
+            break
+        boxes = boxes.halves(torch.cat(axes))
+    return Outcome(boxes, needed, bounded)

@@ -1,4 +1,4 @@
-"""Tensor products of cubic B-splines, and their polynomials on boxes.
+"""Tensor products of cubic B-splines.
 
 W(z) = sum_k c_k prod_j B_kj(z_j) is twice continuously differentiable in every coordinate, and on each cell of its mesh
 a polynomial of degree 3 in each of them (C. de Boor, A Practical Guide to Splines, 1978).
@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 import torch
 from scipy.interpolate import BSpline
 from torch import Tensor
 
-from pirl_rl.proofs.affine import ROUNDING, Affine
+from pirl_rl.proofs.affine import ROUNDING
 from pirl_rl.proofs.boxes import Boxes
+from pirl_rl.proofs.polynomials import Polynomials
 
 DEGREE = 3
 
@@ -25,60 +28,33 @@ def knots_of(edges: np.ndarray) -> np.ndarray:
     return np.concatenate([edges[:1].repeat(DEGREE), edges, edges[-1:].repeat(DEGREE)])
 
 
-def nodes_of(edges: np.ndarray) -> np.ndarray:
-    """The points (k + DEGREE,), one for each spline, at which conditions are imposed: means of inner knots."""
-    knots = knots_of(edges)
-    return np.array([knots[i + 1 : i + 1 + DEGREE].mean() for i in range(len(knots) - DEGREE - 1)])
-
-
 def basis(edges: np.ndarray, points: np.ndarray, derivative: int = 0) -> np.ndarray:
-    """The values (P, k + DEGREE) of all splines, or of a derivative, at points (P,)."""
+    """The values (P, k + DEGREE) of all splines of one coordinate, or of a derivative, at points (P,)."""
     knots = knots_of(edges)
     splines = BSpline(knots, np.eye(len(knots) - DEGREE - 1), DEGREE)
     return (splines.derivative(derivative) if derivative else splines)(points)
 
 
-class Polynomials:
-    """Polynomials (N, 4, ..., 4) in the coordinates e in [-1, 1]^d of N boxes, by powers of each coordinate.
+def design(edges: Sequence[np.ndarray], x: np.ndarray, derived: Sequence[int] = ()) -> Any:
+    """The sparse matrix (P, N) of the values of all N products of splines at points (P, n).
 
     Args:
-        powers: the coefficients.
-        half_width: halves (N, d) of the boxes' sides, by which derivatives are divided.
-        rounding: bounds (N,) of the errors of each coefficient.
+        edges: the edges of the cells along each of n axes.
+        x: the points.
+        derived: the axes along which the products are differentiated, each as often as it is named.
     """
-
-    def __init__(self, powers: Tensor, half_width: Tensor, rounding: Tensor):
-        self.powers, self.half_width, self.rounding = powers, half_width, rounding
-
-    def at(self, index: Tensor) -> Polynomials:
-        """The polynomials of some of the boxes."""
-        return Polynomials(self.powers[index], self.half_width[index], self.rounding[index])
-
-    def derivative(self, axis: int) -> Polynomials:
-        """The derivative in a coordinate of the box's own space, per unit."""
-        place = axis + 1
-        order = torch.arange(1, self.powers.shape[place], dtype=torch.float64)
-        shape = [1] * self.powers.ndim
-        shape[place] = -1
-        moved = self.powers.narrow(place, 1, len(order)) * order.reshape(shape)
-        width = self.half_width[:, axis].reshape(-1, *[1] * (self.powers.ndim - 1))
-        return Polynomials(moved / width, self.half_width, len(order) * self.rounding / self.half_width[:, axis])
-
-    def enclosure(self) -> Affine:
-        """The polynomials as affine forms (N,): what is not linear is bounded by the sum of its coefficients."""
-        dim = self.powers.ndim - 1
-        flat = self.powers.flatten(1)
-        zero = [slice(None), *[0] * dim]
-        units = []
-        for axis in range(dim):
-            index = list(zero)
-            index[axis + 1] = 1
-            constant = self.powers.shape[axis + 1] == 1
-            units.append(torch.zeros_like(flat[:, 0]) if constant else self.powers[tuple(index)])
-        centre, slopes = self.powers[tuple(zero)], torch.stack(units)
-        total = flat.abs().sum(-1)
-        rest = (total - centre.abs() - slopes.abs().sum(0)).clamp(min=0)
-        return Affine(centre, slopes, rest + flat.shape[-1] * (self.rounding + ROUNDING * total))
+    numbers, values = np.zeros((len(x), 1), int), np.ones((len(x), 1))
+    for j, axis in enumerate(edges):
+        # The splines that are not 0 at a point are those of its cell.
+        cell = np.clip(np.searchsorted(axis, x[:, j], side="right") - 1, 0, len(axis) - 2)
+        active = cell[:, None] + np.arange(DEGREE + 1)
+        rows = np.take_along_axis(basis(axis, x[:, j], [*derived].count(j)), active, 1)
+        size = (len(x), (DEGREE + 1) ** (j + 1))
+        numbers = (numbers[:, :, None] * (len(axis) - 1 + DEGREE) + active[:, None, :]).reshape(size)
+        values = (values[:, :, None] * rows[:, None, :]).reshape(size)
+    width = math.prod(len(axis) - 1 + DEGREE for axis in edges)
+    starts = np.arange(0, numbers.size + 1, numbers.shape[1])
+    return sp.csr_matrix((values.ravel(), numbers.ravel(), starts), shape=(len(x), width))
 
 
 class Spline:
@@ -95,12 +71,7 @@ class Spline:
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """W (P,) at points (P, d)."""
-        result = self.coefficients.numpy()
-        rows = [basis(axis, points[:, j]) for j, axis in enumerate(self.edges)]
-        result = np.tensordot(rows[0], result, 1)
-        for row in rows[1:]:
-            result = np.einsum("pk,pk...->p...", row, result)
-        return result
+        return design(self.edges, points) @ self.coefficients.numpy().ravel()
 
     def on(self, boxes: Boxes) -> Polynomials:
         """The polynomials on boxes, each within one cell."""

@@ -1,132 +1,149 @@
-"""A function below the value of a policy: the spline W with L^pi W = m >= 0 that is 0 where paths end in failure.
+"""A function below the value of a policy: a spline W with L^pi W = m >= 0 and W <= payoff where paths end.
 
-W solves the linear HJB equation of the policy, Eq. (linear_pde), with a source m that lowers it, by collocation of
-splines in space and the trapezoidal rule in time. Where L^pi W >= 0 fails between the nodes, m is raised and W solved
-again. What is proved does not depend on how W was found.
+W solves the linear HJB equation of the policy, Eq. (linear_pde), with a source m that lowers it: level by level of tau
+by the trapezoidal rule, and in space by least squares at two Gauss points of each cell along each axis. Least squares
+are stable where there is no noise and at faces, where the equations of collocation oscillate. What is proved does not
+depend on how W was found.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 import torch
 from scipy.interpolate import make_interp_spline
-from scipy.sparse.linalg import splu
-from torch import Tensor
+from scipy.sparse.linalg import SuperLU, splu
 
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.proofs.mesh import Mesh
-from pirl_rl.proofs.spline import DEGREE, Spline, basis, nodes_of
-from pirl_rl.proofs.target import continuation_rows
+from pirl_rl.proofs.faces import face_points, sides, smooth_target
+from pirl_rl.proofs.mesh import Mesh, product
+from pirl_rl.proofs.points import Points, Policy
+from pirl_rl.proofs.spline import DEGREE, Spline, design
 
 RAMP = 0.1
 """The share of the horizon in which W rises at the target from 0 to 1, without which it would jump at tau = 0."""
 
-WIDTH = 0.15
-"""The share of the depth of the safe set over which W falls to 0 towards its faces at tau = 0."""
+WIDTH, CELLS = 0.15, 4
+"""W falls to 0 towards faces at tau = 0 over this share of the depth of the safe set, and this number of cells."""
 
 FIRST_STEPS = 4
 """The number of first steps in time that are implicit, which damp what the trapezoidal rule does not."""
 
-Policy = Callable[[Tensor, Tensor], Tensor]
+FACE_WEIGHT = 30.0
+"""The weight of the values on faces in the least squares, where an equation of the interior has 1."""
+
+SMOOTHING = 1e-3
+"""The weight of the third differences of the coefficients, which continue W smoothly into A and B."""
+
+GAUSS = ((1 - 3**-0.5) / 2, (1 + 3**-0.5) / 2)
+"""The places of two Gauss points in a cell [0, 1]."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """The least squares of one step in time.
+
+    Attributes:
+        implicit: the share of the new level in the operator: 1, or 1/2 for the trapezoidal rule.
+        rows: the matrix (equations, N).
+        normal: the factors of its normal equations.
+    """
+
+    implicit: float
+    rows: Any
+    normal: SuperLU
 
 
 class Equation:
-    """L^pi W = m with its conditions, on the nodes of a mesh.
+    """L^pi W = m with its conditions, on a mesh.
 
     Args:
         problem: the physics.
-        policy: maps tau (N,) and x (N, n), float64, to the control (N, m) in SI units.
+        policy: the policy.
         mesh: the mesh.
     """
 
     def __init__(self, problem: ReachAvoidProblem, policy: Policy, mesh: Mesh):
-        self.problem, self.mesh, self.x = problem, mesh, mesh.nodes()
-        x = torch.from_numpy(self.x)
-        self._drift, self._variance = [], []
-        for tau in mesh.taus:
-            u = policy(torch.full((len(x),), tau, dtype=torch.float64), x)
-            sigma = problem.diffusion(x, u)
-            self._drift.append(problem.drift(x, u).numpy())
-            self._variance.append((sigma @ sigma.mT).numpy())
-        reach = problem.objective == "reach-avoid"
-        self._target = problem.reached(x).numpy() if reach else np.zeros(len(x), bool)
-        self._continued, self._faces = continuation_rows(problem, mesh, self._target)
-        self._zero = [self._ends_in_failure(k) for k in range(len(mesh.taus))]
-        self._values, self._slopes, self._curvatures = self._matrices()
+        self.problem, self.mesh = problem, mesh
+        x = product(mesh.points(GAUSS))
+        states = torch.from_numpy(x)
+        outside, none = np.ones(len(x), bool), np.zeros((0, x.shape[1]))
+        target, avoid = none, none
+        if problem.objective == "reach-avoid":
+            level = smooth_target(problem, states)
+            outside, target = (level(states) > 0).numpy(), face_points(level, mesh, x)
+        if problem.has_avoid_set:
+            outside &= ~problem.failed(states).numpy()
+            avoid = face_points(lambda points: problem.avoid_constraints(points).amin(-1), mesh, x)
+            avoid = avoid[((avoid > mesh.low) & (avoid < mesh.high)).all(-1)]  # the others are those of the sides
+        ends, self._axis, self._outward = sides(problem, mesh, GAUSS)
+        self.points, self._ends = Points(problem, policy, mesh, x[outside]), Points(problem, policy, mesh, ends)
+        self._target, self._avoid = design(mesh.space, target), design(mesh.space, avoid)
+        self._smoothing = SMOOTHING * _third_differences(mesh.shape)
+        self._operators = [self.points.operator(tau) for tau in mesh.taus]
+        self._steps = [self._step(k) for k in range(1, len(mesh.taus))]
+        self._start = self._start_from(x)
 
     def solve(self, source: np.ndarray) -> Spline:
-        """W for a source m (levels of tau, N) >= 0, in 1/s."""
-        taus = self.mesh.taus
-        rows, before = [self._inverse(0, self._values, self._start())], self._operator(0)
-        for k in range(1, len(taus)):
-            step, after = taus[k] - taus[k - 1], self._operator(k)
-            share = 1.0 if k <= FIRST_STEPS else 0.5
-            right = (self._values + (1 - share) * step * before) @ rows[-1]
-            right -= step * (share * source[k] + (1 - share) * source[k - 1])
-            right[self._zero[k]] = 0.0
-            right[self._target] = 0.0
-            right[self._faces] = smoothstep(taus[k] / (RAMP * self.problem.horizon))
-            rows.append(self._inverse(k, self._values - share * step * after, right))
-            before = after
-        ends = [[(1, self._rate(k, rows[k], source[k]))] for k in (0, -1)]
-        spline = make_interp_spline(taus, np.array(rows), k=DEGREE, bc_type=(ends[0], ends[1]))
+        """W for a source m (levels of tau, N) >= 0 at the points, in 1/s."""
+        taus, rows = self.mesh.taus, [self._start]
+        for k, step in enumerate(self._steps, 1):
+            length, new = taus[k] - taus[k - 1], step.implicit
+            right = self.points.values @ rows[-1] + (1 - new) * length * (self._operators[k - 1] @ rows[-1])
+            right -= length * (new * source[k] + (1 - new) * source[k - 1])
+            reached = FACE_WEIGHT * smoothstep(taus[k] / (RAMP * self.problem.horizon))
+            zeros = np.zeros(step.rows.shape[0] - len(right) - self._target.shape[0])
+            right = np.concatenate([right, np.full(self._target.shape[0], reached), zeros])
+            rows.append(step.normal.solve(step.rows.T @ right))
+        # make_interp_spline has no knots at the first and the last inner level. The spline that has all knots and the
+        # same slopes at both ends is the same function.
+        slopes = make_interp_spline(taus, np.array(rows), k=DEGREE)(taus[[0, -1]], nu=1)
+        spline = make_interp_spline(taus, np.array(rows), k=DEGREE, bc_type=([(1, slopes[0])], [(1, slopes[1])]))
         return Spline(self.mesh.edges, spline.c.reshape(-1, *self.mesh.shape))
 
-    def _start(self) -> np.ndarray:
-        """W (N,) at tau = 0."""
+    def _step(self, k: int) -> Step:
+        """The equations from level k - 1 to level k: of the interior, of A, and those with the value 0."""
+        taus, new = self.mesh.taus, 1.0 if k <= FIRST_STEPS else 0.5
+        interior = self.points.values - new * (taus[k] - taus[k - 1]) * self._operators[k]
+        crossed = self._ends.values[self._crossed(taus[k])]
+        given = [FACE_WEIGHT * matrix for matrix in (self._target, self._avoid, crossed)]
+        rows = sp.vstack([interior, *given, self._smoothing]).tocsr()
+        symmetric = {"SymmetricMode": True}
+        normal = splu((rows.T @ rows).tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=1e-3, options=symmetric)
+        return Step(new, rows, normal)
+
+    def _crossed(self, tau: float) -> np.ndarray:
+        """Whether paths cross the sides of the box outward at their points: by noise, or along the drift."""
+        f, a = self._ends.rates(tau)
+        index = np.arange(len(f)), self._axis
+        return (a[*index, self._axis] > 0) | (self._outward * f[index] >= 0)
+
+    def _start_from(self, x: np.ndarray) -> np.ndarray:
+        """The coefficients (N,) of W at tau = 0, from its values at points (P, n)."""
         if self.problem.objective == "reach-avoid":
-            return np.zeros(len(self.x))
-        levels = self.problem.avoid_constraints(torch.from_numpy(self.x)).numpy()
-        return smoothstep(levels / (WIDTH * levels.max(0))).prod(-1)
+            return np.zeros(self.points.values.shape[1])
+        levels = self.problem.avoid_constraints(torch.from_numpy(x)).numpy()
+        # The depth is about half of the box.
+        width = max(WIDTH, 2 * CELLS / min(self.mesh.cells[1:]))
+        values = smoothstep(levels / (width * levels.max(0))).prod(-1)
+        rows = sp.vstack([design(self.mesh.space, x), self._smoothing]).tocsr()
+        right = np.concatenate([values, np.zeros(self._smoothing.shape[0])])
+        return splu((rows.T @ rows).tocsc()).solve(rows.T @ right)
 
-    def _ends_in_failure(self, k: int) -> np.ndarray:
-        """The nodes (N,) in B, and those in sides of the mesh that paths cross outward, at a level of tau."""
-        x, f, a = self.x, self._drift[k], self._variance[k]
-        result = self.problem.failed(torch.from_numpy(x)).numpy() & ~self._target
-        for axis, (edges, beyond) in enumerate(zip(self.mesh.edges[1:], self.mesh.beyond, strict=True)):
-            for end, outward, in_target in ((edges[0], -1, beyond[0]), (edges[-1], 1, beyond[1])):
-                side = np.isclose(x[:, axis], end, rtol=0, atol=1e-12) & ~self._target
-                crossed = (a[:, axis, axis] > 0) | (outward * f[:, axis] >= 0)
-                result = np.where(side, crossed & (not in_target), result)
-        return result
 
-    def _matrices(self) -> tuple[Any, list[Any], dict[tuple[int, int], Any]]:
-        """The values, first and second derivatives in space of all splines at the nodes."""
-        axes = self.mesh.edges[1:]
-        tables = [[sp.csr_matrix(basis(axis, nodes_of(axis), order)) for order in range(3)] for axis in axes]
-
-        def product(*derived: int) -> Any:
-            result = tables[0][derived.count(0)]
-            for j in range(1, len(axes)):
-                result = sp.kron(result, tables[j][derived.count(j)], format="csr")
-            return result
-
-        n = range(len(axes))
-        return product(), [product(i) for i in n], {(i, j): product(i, j) for i in n for j in n if i <= j}
-
-    def _operator(self, k: int) -> Any:
-        """f . grad + 1/2 Tr(sigma sigma^T hess) at the nodes, at a level of tau."""
-        f, a = self._drift[k], self._variance[k]
-        result = sum(sp.diags(f[:, i]) @ slope for i, slope in enumerate(self._slopes))
-        for (i, j), curvature in self._curvatures.items():
-            result = result + sp.diags(a[:, i, j] * (0.5 if i == j else 1.0)) @ curvature
-        return result
-
-    def _inverse(self, k: int, left: Any, right: np.ndarray) -> np.ndarray:
-        """The coefficients that solve `left` at free nodes, and have the given values at all others."""
-        kind = np.where(self._target, 2, np.where(self._zero[k], 1, 0))
-        parts = (left, self._values, self._continued)
-        rows: Any = sum(sp.diags((kind == i).astype(float)) @ part for i, part in enumerate(parts))
-        return splu(rows.tocsc()).solve(right)
-
-    def _rate(self, k: int, c: np.ndarray, source: np.ndarray) -> np.ndarray:
-        """The derivative of the coefficients in tau at a level of tau at which the given values stand still."""
-        right = (self._operator(k) @ c - source) * ~(self._zero[k] | self._target)
-        return self._inverse(k, self._values, right)
+def _third_differences(shape: tuple[int, ...]) -> Any:
+    """The matrix (equations, N) of the third differences of coefficients along each axis."""
+    parts = []
+    for axis in range(len(shape)):
+        factors = [sp.csr_matrix(np.diff(np.eye(n), 3, 0)) if i == axis else sp.eye(n) for i, n in enumerate(shape)]
+        part = factors[0]
+        for factor in factors[1:]:
+            part = sp.kron(part, factor)
+        parts.append(part)
+    return sp.vstack(parts).tocsr()
 
 
 def smoothstep(share: np.ndarray | float) -> np.ndarray:

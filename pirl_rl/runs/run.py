@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from numbers import Real
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -205,20 +206,30 @@ class Run:
         certifiers = make_certifiers(names, episodes, at_least, states, rollouts, share, success)
         return certify(self.solution, simulator, where, certifiers, confidence, picked_from, seed)
 
-    def prove(self, cells: int = 80, steps: int = 80, rounds: int = 20, halvings: int = 8) -> Proof:
+    def prove(self, cells: int = 64, steps: int = 60, rounds: int = 40, halvings: int = 10) -> Proof:
         """Prove a lower bound of the policy's probability of success under continuous feedback, see `pirl_rl.proofs`.
 
         Args:
             cells: the number of cells of the bound's mesh along each state, at most three.
             steps: the number of its cells along tau.
-            rounds: the largest number of times that the bound is fitted.
+            rounds: the largest number of times that the bound is fitted to points, and then to boxes.
             halvings: the number of times that a box may be halved.
 
         Raises:
             ProofError: the problem has too many states, or a function whose enclosure is not known.
         """
-        networks = Deployed(self.solution, self.simulator).digest()
-        return prove_success(self.solution, networks, Settings(cells, steps, rounds, halvings))
+        return prove_success(self.solution, self._digest(), Settings(cells, steps, rounds, halvings))
+
+    def load_proof(self, path: str | Path) -> Proof:
+        """The bound that `certify method=interval` wrote to a file `proof.npz`.
+
+        Raises:
+            ProofError: the file cannot be read, or it is about other networks than those of this run.
+        """
+        return Proof.load(path, self._digest())
+
+    def _digest(self) -> str:
+        return Deployed(self.solution, self.simulator).digest()
 
     def _simulator(self, dt: float | None, substeps: int | None, crossing: Crossing | None) -> Simulator:
         return _changed(self.simulator, dt, substeps, crossing)

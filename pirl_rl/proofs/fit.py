@@ -1,0 +1,140 @@
+"""The source of a subsolution: raised until L^pi W >= 0 holds at points between those of the least squares."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.interpolate import BSpline
+from scipy.ndimage import maximum_filter
+
+from pirl_rl.progress import announce
+from pirl_rl.proofs.boxes import Boxes
+from pirl_rl.proofs.mesh import product
+from pirl_rl.proofs.points import Points, Policy
+from pirl_rl.proofs.spline import DEGREE, knots_of
+from pirl_rl.proofs.subsolution import Equation
+
+LEAST = 0.003
+"""The least value of L^pi W at which a fit aims, in 1/s."""
+
+SLACK = 0.3
+"""The share of the variation of L^pi W within a cell that its least value there is to exceed."""
+
+ENOUGH = 0.75
+"""A cell is left alone when it has this share of what the fit aims at."""
+
+RAISE = 1.2
+"""The factor by which the source is raised beyond what is missing."""
+
+LARGEST = 2.0
+"""The largest size of W outside A and B for which the mesh resolves it; its exact values are between 0 and 1."""
+
+SHARES = (1.0, 0.3, 0.1, 0.03)
+"""The source is raised by the first of these shares for which the mesh resolves W."""
+
+PLACES = (0.0, 1 / 3, 2 / 3, 1.0)
+"""Where L^pi W is evaluated in each cell along each state."""
+
+TIMES = (0.0, 0.5, 1.0)
+"""Where L^pi W is evaluated in each cell along tau."""
+
+
+class Fit:
+    """W for a source that is raised where it must be.
+
+    Args:
+        equation: gives W for a source.
+        policy: the policy.
+        margin: where W is not above this, nothing is asked.
+
+    Attributes:
+        spline: W.
+    """
+
+    def __init__(self, equation: Equation, policy: Policy, margin: float):
+        self.equation, self.mesh, self.margin = equation, equation.mesh, margin
+        problem, x = equation.problem, product(self.mesh.points(PLACES))
+        states = torch.from_numpy(x)
+        ended = problem.failed(states)
+        if problem.objective == "reach-avoid":
+            ended = ended | problem.reached(states)
+        self._points = Points(problem, policy, self.mesh, x[~ended.numpy()])
+        self._cells = self.mesh.cell_of(self._points.x)
+        self._own_cells = self.mesh.cell_of(equation.points.x)
+        taus = self.mesh.taus
+        times = np.unique((taus[:-1, None] + np.diff(taus)[:, None] * np.array(TIMES)).ravel())
+        self._rates = [(tau, *self._points.rates(tau)) for tau in times]
+        self._source = np.full((len(taus), len(equation.points.x)), LEAST)
+        self.spline = equation.solve(self._source)
+
+    def at_points(self, rounds: int) -> None:
+        """Raise the source until L^pi W is what the fit aims at in all cells, or `rounds` times.
+
+        It ends where the source makes it worse, as on a mesh that is too coarse.
+        """
+        for number in range(1, rounds + 1):
+            announce(f"fitting a bound, round {number}")
+            missing = self._missing()
+            if not missing.any() or not self.raise_in(missing):
+                break
+
+    def on_boxes(self, boxes: Boxes, low: torch.Tensor) -> bool:
+        """Raise the source in the cells of boxes (N,) on which a lower bound (N,) of L^pi W is negative.
+
+        Returns:
+            Whether the source could be raised.
+        """
+        missing = np.zeros(self.mesh.cells)
+        np.maximum.at(missing, tuple(boxes.cell.T.numpy()), (LEAST - low).clamp(min=0).numpy())
+        return self.raise_in(missing)
+
+    def raise_in(self, missing: np.ndarray) -> bool:
+        """Raise the source by what is missing in each cell (cells of tau, cells of each state) and its neighbours.
+
+        Returns:
+            Whether W is bounded with the raised source; otherwise the source is left as it is.
+        """
+        around = maximum_filter(missing, size=(1, *[DEGREE] * (missing.ndim - 1)), mode="constant")
+        padded = np.pad(around, [(1, 1), *[(0, 0)] * (missing.ndim - 1)], mode="edge")
+        levels = np.maximum(padded[:-1], padded[1:])
+        raised = RAISE * np.stack([level[self._own_cells] for level in levels])
+        for share in SHARES:
+            source = self._source + share * raised
+            spline = self.equation.solve(source)
+            coefficients = spline.coefficients.numpy()
+            values = self.equation.points.values @ coefficients.reshape(len(coefficients), -1).T
+            if np.abs(values).max() <= LARGEST:
+                self._source, self.spline = source, spline
+                return True
+        return False
+
+    def _missing(self) -> np.ndarray:
+        """What L^pi W lacks in each cell (cells of tau, cells of each state)."""
+        least, most = np.full(self.mesh.cells, np.inf), np.full(self.mesh.cells, -np.inf)
+        last = self.mesh.cells[0] - 1
+        for tau, residual, w in self._residuals():
+            asked = w > self.margin
+            low, high = np.where(asked, residual, np.inf), np.where(asked, residual, -np.inf)
+            # A level of tau belongs to the cells on both of its sides.
+            sides = (np.searchsorted(self.mesh.taus, tau, side) - 1 for side in ("left", "right"))
+            for k in {min(max(int(side), 0), last) for side in sides}:
+                np.minimum.at(least[k], self._cells, low)
+                np.maximum.at(most[k], self._cells, high)
+        asked = np.isfinite(least)
+        wanted = LEAST + SLACK * np.where(asked, most - least, 0.0)
+        return np.where(asked & (least < ENOUGH * wanted), wanted - least, 0.0)
+
+    def _residuals(self):
+        """tau, and L^pi W (P,) and W (P,) at the points between, for each time."""
+        coefficients = self.spline.coefficients.numpy()
+        curve = BSpline(knots_of(self.mesh.taus), coefficients.reshape(len(coefficients), -1), DEGREE)
+        rate, points = curve.derivative(), self._points
+        for tau, f, a in self._rates:
+            c = curve(tau)
+            residual = -(points.values @ rate(tau))
+            for i, slope in enumerate(points.slopes):
+                residual += f[:, i] * (slope @ c)
+            for (i, j), curvature in points.curvatures.items():
+                if a[:, i, j].any():
+                    residual += a[:, i, j] * (0.5 if i == j else 1.0) * (curvature @ c)
+            yield tau, residual, points.values @ c
