@@ -8,7 +8,9 @@ from pirl_rl.certificates.band import ValueBand
 from pirl_rl.certificates.bounds import lower_bound, order_of_quantile, upper_bound
 from pirl_rl.certificates.certificate import CLAIMS, Certificate, certify, make_certifiers
 from pirl_rl.certificates.claim import Claim, Level
+from pirl_rl.certificates.corollary import diagnose
 from pirl_rl.certificates.deployed import Deployed, LawOfStarts, OneStart, Starts
+from pirl_rl.certificates.diagnostic import Diagnostic
 from pirl_rl.certificates.sequence import anytime_lower_bound, anytime_upper_bound
 from pirl_rl.certificates.success import SuccessBound
 from pirl_rl.certificates.threshold import SafeThreshold
@@ -18,6 +20,7 @@ __all__ = [
     "Certificate",
     "Claim",
     "Deployed",
+    "Diagnostic",
     "LawOfStarts",
     "Level",
     "OneStart",
@@ -28,6 +31,7 @@ __all__ = [
     "anytime_lower_bound",
     "anytime_upper_bound",
     "certify",
+    "diagnose",
     "lower_bound",
     "make_certifiers",
     "order_of_quantile",

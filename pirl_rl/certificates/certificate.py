@@ -1,16 +1,21 @@
-"""A statistical certificate: claims about the frozen policy of a run and its V, with all that they depend on."""
+"""A statistical certificate: claims about the frozen policy of a run and its V, with all that they depend on.
+
+Beside its claims it may hold diagnostics, which bound nothing.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from pirl_rl.arguments import check_integer
 from pirl_rl.certificates.band import ValueBand
 from pirl_rl.certificates.bounds import check_level
 from pirl_rl.certificates.claim import Certifier, Claim, Level
-from pirl_rl.certificates.deployed import Deployed, Rngs, Starts
+from pirl_rl.certificates.corollary import diagnose
+from pirl_rl.certificates.deployed import SEEDS, Deployed, Rngs, Starts
+from pirl_rl.certificates.diagnostic import Diagnostic
 from pirl_rl.certificates.success import SuccessBound
 from pirl_rl.certificates.threshold import SafeThreshold
 from pirl_rl.errors import ArgumentError
@@ -30,6 +35,7 @@ class Certificate:
         networks: the SHA-256 of the networks.
         picked_from: the number of runs that were compared on the same data.
         seed: the seed of starts and noise.
+        diagnostics: what was asked for beside the claims, by name; it bounds nothing.
     """
 
     claims: dict[str, Claim]
@@ -39,14 +45,17 @@ class Certificate:
     networks: str
     picked_from: int
     seed: int
+    diagnostics: dict[str, Diagnostic] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """The certificate as plain values, for a JSON file."""
-        return vars(self) | {"claims": {name: claim.to_dict() for name, claim in self.claims.items()}}
+        parts = {"claims": self.claims, "diagnostics": self.diagnostics}
+        return vars(self) | {key: {name: one.to_dict() for name, one in part.items()} for key, part in parts.items()}
 
     def lines(self) -> list[str]:
-        """The sentences of all claims."""
-        return [sentence for claim in self.claims.values() for sentence in claim.sentences]
+        """The sentences of all claims, and after them those of the diagnostics."""
+        parts = (*self.claims.values(), *self.diagnostics.values())
+        return [sentence for part in parts for sentence in part.sentences]
 
 
 CLAIMS = ("success", "threshold", "band")
@@ -85,6 +94,7 @@ def certify(
     confidence: float = 0.95,
     picked_from: int = 1,
     seed: int = 0,
+    corollary: bool = False,
 ) -> Certificate:
     """Make claims about a frozen policy and its V.
 
@@ -99,6 +109,7 @@ def certify(
         confidence: the level of each claim.
         picked_from: the number of runs, or seeds, out of which this one is picked on the same data.
         seed: seed of starts and noise; all claims use streams of their own.
+        corollary: whether the diagnostic of `pirl_rl.certificates.corollary` is made too.
 
     Raises:
         ArgumentError: a level or a number is out of range.
@@ -106,6 +117,10 @@ def certify(
     check_level("confidence", confidence)
     check_integer("picked_from", picked_from, 1)
     check_integer("seed", seed, 0)
+    if not isinstance(corollary, bool):
+        raise ArgumentError(f"corollary: expected true or false, got {corollary!r}")
+    # Before the paths, which take longer: it may refuse its arguments.
+    diagnostics = {"corollary": diagnose(solution, simulator, confidence, SEEDS + seed)} if corollary else {}
     deployed, level = Deployed(solution, simulator), Level(confidence, picked_from)
     claims = {
         name: certifier(deployed, starts, level, Rngs.of(solution, len(certifiers) * seed + i))
@@ -119,4 +134,5 @@ def certify(
         networks=deployed.digest(),
         picked_from=picked_from,
         seed=seed,
+        diagnostics=diagnostics,
     )

@@ -27,6 +27,7 @@ simulator, which holds each control for a step. Problems have at most three stat
     confidence   the level of each claim, 0.95 by default
     picked_from  the number of runs, or of seeds, that were compared on the same data, 1 by default
     seed         the seed of starts and noise, 0 by default
+    corollary    true adds Corollary 1 of the paper as numbers: a diagnostic, which bounds nothing; false by default
     trust        modules of your own that the run may import, such as trust=[my_module]
 
     With method=interval:
@@ -96,6 +97,8 @@ def _certify(run: Run, directory: RunDirectory, settings: dict[str, Any]) -> lis
     with replacing(directory.certificate) as file:
         file.write(json.dumps(certificate.to_dict(), indent=2) + "\n")
     lines = [f"{name:<10}" + f"\n{'':<10}".join(claim.sentences) for name, claim in certificate.claims.items()]
+    for name, diagnostic in certificate.diagnostics.items():
+        lines += [f"{name}, a diagnostic", *(f"{'':<10}{sentence}" for sentence in diagnostic.sentences)]
     return [*lines, f"written   {directory.certificate}"]
 
 

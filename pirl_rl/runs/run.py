@@ -171,6 +171,7 @@ class Run:
         confidence: float = 0.95,
         picked_from: int = 1,
         seed: int = 0,
+        corollary: bool = False,
     ) -> Certificate:
         """Exact statistical bounds of what the frozen policy does, see `pirl_rl.certificates`.
 
@@ -193,6 +194,8 @@ class Run:
             confidence: the level of each claim.
             picked_from: the number of runs, or seeds, out of which this one was picked on the same data.
             seed: seed of starts and noise, separate from those of all evaluators.
+            corollary: whether the certificate has Corollary 1 of the paper as numbers too: a diagnostic, which bounds
+                nothing, see `pirl_rl.certificates.corollary`.
         """
         simulator = _changed(make_evaluation_simulator(self.config, self.problem), dt, substeps, crossing)
         if x is None:
@@ -204,7 +207,7 @@ class Run:
             where = OneStart(times.item(), tuple(state[0].tolist()))
         names = claims if claims is not None else ("success",) if x is not None else ("success", "threshold", "band")
         certifiers = make_certifiers(names, episodes, at_least, states, rollouts, share, success)
-        return certify(self.solution, simulator, where, certifiers, confidence, picked_from, seed)
+        return certify(self.solution, simulator, where, certifiers, confidence, picked_from, seed, corollary)
 
     def prove(self, cells: int = 64, steps: int = 60, rounds: int = 40, halvings: int = 10) -> Proof:
         """Prove a lower bound of the policy's probability of success under continuous feedback, see `pirl_rl.proofs`.
