@@ -54,6 +54,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from pirl_rl.commands.console import quiet_libraries, reported
+from pirl_rl.commands.report import draw_again
 from pirl_rl.errors import ConfigError
 from pirl_rl.files import replacing
 from pirl_rl.progress import announce, helped
@@ -83,10 +84,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         methods = [item.partition("=")[2] for item in others if item.startswith("method=")]
         method = methods[-1] if methods else "statistical"
         settings = _settings(method, [item for item in others if not item.startswith("method=")])
-        run, directory = load_run(folder, settings.pop("trust", ())), RunDirectory(folder)
+        trust = settings.pop("trust", ())
+        run, directory = load_run(folder, trust), RunDirectory(folder)
         directory.refuse_links()
         lines = _prove(run, directory, settings) if method == "interval" else _certify(run, directory, settings)
     print("\n".join(lines))
+    if run.config.get("report", True):
+        draw_again(folder, trust)
 
 
 def _certify(run: Run, directory: RunDirectory, settings: dict[str, Any]) -> list[str]:

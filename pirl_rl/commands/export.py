@@ -46,6 +46,7 @@ COPIED = (
     RunDirectory.PROOF,
     RunDirectory.BOUND,
     RunDirectory.METRICS,
+    RunDirectory.MACHINE,
     RunDirectory.FIGURES,
 )
 

@@ -3,6 +3,6 @@
 They are about the SDE under continuous feedback, while certificates are about a simulator that holds its controls.
 """
 
-from pirl_rl.proofs.proof import Proof, Settings, prove_success
+from pirl_rl.proofs.proof import Proof, Settings, load_bound, prove_success
 
-__all__ = ["Proof", "Settings", "prove_success"]
+__all__ = ["Proof", "Settings", "load_bound", "prove_success"]

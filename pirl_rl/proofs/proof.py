@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import copy
 import time
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -105,7 +107,7 @@ class Proof:
         if not self.holds:
             left = ", ".join(f"{name} on {len(boxes):,} boxes" for name, boxes in self.unproved.items())
             raise ProofError(f"no bound: conditions are not proved, {left}")
-        return np.maximum(self.spline(np.column_stack([tau, x])) - self.margin, 0.0)
+        return _bound(self.spline, self.margin, tau, x)
 
     def to_dict(self, problem: ReachAvoidProblem) -> dict[str, Any]:
         """What is proved, as plain values: the bound at tau = T over the box of states, and the boxes that resist."""
@@ -193,6 +195,35 @@ def prove_success(solution: Solution, networks: str, settings: Settings | None =
         networks=networks,
         seconds=time.perf_counter() - started,
     )
+
+
+def load_bound(path: Path, networks: str) -> Callable[[np.ndarray, np.ndarray], np.ndarray] | None:
+    """The bound in a file that `Proof.save` wrote, a function like `Proof.bound`.
+
+    Args:
+        path: the file.
+        networks: the SHA-256 of the policy and V.
+
+    Returns:
+        The function, or None if it was proved for other networks.
+
+    Raises:
+        ProofError: the file is broken.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if str(file["networks"]) != networks:
+                return None
+            axes = sum(name.startswith("edges_") for name in file.files)
+            spline = Spline([file[f"edges_{axis}"] for axis in range(axes)], file["coefficients"])
+            return partial(_bound, spline, float(file["margin"]))
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise ProofError(f"{path}: expected a proved bound, got {error}") from error
+
+
+def _bound(spline: Spline, margin: float, tau: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """W - margin (N,), and 0 where it is negative."""
+    return np.maximum(spline(np.column_stack([tau, x])) - margin, 0.0)
 
 
 def _feedback(solution: Solution) -> Callable[[Any, Any], Any]:
