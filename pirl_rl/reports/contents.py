@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -113,6 +114,11 @@ class Contents:
         """The problem, the method and the seed."""
         method = self.config.get("method_name", "unknown")
         return f"{self.statement.name}, {method} method, seed {self.config.get('seed')}"
+
+    @property
+    def argument(self) -> str:
+        """The argument by which a command line in the folder that holds the run names it."""
+        return shlex.quote(f"run={self.name}")
 
     @property
     def of_object(self) -> bool:
