@@ -5,12 +5,16 @@ function playable(root) {
   const button = root.querySelector(".play"), tau = root.querySelector(".tau"), words = button.textContent;
   let timer = null;
   const set = (value) => { tau.value = value; tau.dispatchEvent(new Event("input")); };
-  const stop = () => { clearInterval(timer); timer = null; button.textContent = words; };
+  const stop = () => { clearTimeout(timer); timer = null; button.textContent = words; };
+  const step = (value) => {
+    set(value);
+    // The next step waits until this one is drawn.
+    timer = setTimeout(() => (value > 0 ? step(value - 1) : stop()), 250);
+  };
   button.addEventListener("click", () => {
     if (timer) return stop();
-    set(tau.max);
     button.textContent = "Stop";
-    timer = setInterval(() => (Number(tau.value) > 0 ? set(Number(tau.value) - 1) : stop()), 200);
+    step(Number(tau.max));
   });
 }
 
