@@ -17,7 +17,7 @@ from pirl_rl.errors import ProofError
 from pirl_rl.grid import GridSolver
 from pirl_rl.networks import Actor
 from pirl_rl.problems import DoubleIntegrator, DubinsCar, Exit1D, HalfSpace, Pendulum, Reach1D, Safety1D, ZermeloBoat
-from pirl_rl.proofs import Settings, prove_success
+from pirl_rl.proofs import Settings, load_bound, prove_success
 from pirl_rl.proofs.affine import Affine
 from pirl_rl.proofs.boxes import Boxes
 from pirl_rl.proofs.mesh import mesh_of
@@ -245,10 +245,12 @@ def test_the_command_writes_a_proof(trained, in_process):
     assert f"at least {found['best']:.4f}" in text
     run = load_run(trained)
     assert found["networks"] == Deployed(run.solution, run.simulator).digest()
-    arrays = np.load(trained / "proof.npz")
-    spline = Spline([arrays["edges_0"], arrays["edges_1"]], arrays["coefficients"])
-    best = spline(np.array([[run.problem.horizon, *found["best_state"]]])) - arrays["margin"]
+    bound = load_bound(trained / "proof.npz", found["networks"])
+    best = bound(np.array([run.problem.horizon]), np.array([found["best_state"]]))
     assert best[0] == pytest.approx(found["best"])
+    assert load_bound(trained / "proof.npz", "other networks") is None
+    with pytest.raises(ProofError, match="expected a proved bound"):
+        load_bound(trained / "proof.json", found["networks"])
     code, text = in_process(certify)(f"run={trained}", "method=interval", "cells=10", "rounds=1", "halvings=0")
     assert code == 0
     assert "Nothing is proved: some conditions resist." in text

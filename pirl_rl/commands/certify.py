@@ -5,7 +5,7 @@
 
 Plays new paths of the policy, and writes what follows from them, whatever the law of the paths is, to certificate.json
 in the run directory. A certificate counts if it is made once: `picked_from` is the number of runs, or of seeds, out of
-which the best one is shown.
+which the best one is shown. The report of the run is drawn again.
 
 With method=interval it proves a lower bound of the probability of success for all states at once, with certainty, and
 writes it to proof.json and proof.npz. The bound is about continuous feedback, and the statistical claims are about the

@@ -17,9 +17,6 @@ from pirl_rl.reports.names import as_html, control_names, split_unit, state_name
 from pirl_rl.reports.outlines import outlines
 from pirl_rl.sets import Box, Plane
 
-MOST_COORDINATES = 40
-"""The largest number of coordinates that a table lists."""
-
 
 @dataclass(frozen=True)
 class Statement:
@@ -36,7 +33,7 @@ class Statement:
         counts: the numbers of states, controls and noise channels.
         states, controls: name, unit, lower and upper bound of each coordinate, and whether it is periodic.
         equations: a line of MathML for each coordinate.
-        unwritten: the number of coordinates without an equation or a row in the table.
+        shown: the number of coordinates, of the state and of the control, that are written out at most.
         sets: pictures of the sets.
         sources: names of the classes that define the problem, with their code.
     """
@@ -52,7 +49,7 @@ class Statement:
     states: list[dict[str, Any]]
     controls: list[dict[str, Any]]
     equations: list[Markup]
-    unwritten: int
+    shown: int
     sets: list[dict[str, Any]]
     sources: list[tuple[str, str]]
 
@@ -61,7 +58,6 @@ class Statement:
         kind, states, controls = type(problem), problem.states, problem.controls
         like = torch.zeros(1, dtype=torch.float64)
         middle = [entry.center_and_half_width(like)[0].unsqueeze(0) for entry in (states, controls)]
-        written = min(states.dim, MOST_ROWS)
         return cls(
             name=kind.__name__,
             module=kind.__module__,
@@ -74,7 +70,7 @@ class Statement:
             states=_table(state_names(problem), states),
             controls=_table(control_names(problem), controls),
             equations=equations(problem),
-            unwritten=states.dim - written,
+            shown=MOST_ROWS,
             sets=outlines(problem, planes),
             sources=_sources(kind),
         )
@@ -91,7 +87,7 @@ def _table(names: list[str], box: Box) -> list[dict[str, Any]]:
             "periodic": axis in box.periodic,
         }
         for axis, (name, low, high) in enumerate(rows)
-    ][:MOST_COORDINATES]
+    ][:MOST_ROWS]
 
 
 def _notes(kind: type) -> str:
