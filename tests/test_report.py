@@ -379,6 +379,26 @@ def test_a_broken_file_is_named_and_the_old_page_stays(name, folder, drawn, tmp_
     assert not list(copy.glob(".*draft"))
 
 
+def test_a_certificate_that_lacks_an_entry_is_one_sentence(folder, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    (copy / "certificate.json").write_text(json.dumps(CERTIFICATE | {"claims": {"success": {"holds": True}}}))
+    with pytest.raises(RunError, match=r"expected all entries of certificate\.json or proof\.json, .*sentences"):
+        write_report([copy], tmp_path / "page.html")
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_a_page_is_made_smaller_until_it_fits(folder, tmp_path, monkeypatch):
+    whole = write_report([folder], tmp_path / "page.html").stat().st_size
+    monkeypatch.setattr(page, "LARGEST", whole - 1)
+    monkeypatch.setattr(page, "SHARES", (1.0, 1e-3))
+    assert write_report([folder], tmp_path / "page.html").stat().st_size < whole
+    assert "Not shown, since the page would be too large" in Page(tmp_path / "page.html").words
+    monkeypatch.setattr(page, "LARGEST", 1_000)
+    with pytest.raises(RunError, match="expected a page of at most 1,000 bytes"):
+        write_report([folder], tmp_path / "other.html")
+
+
 def test_a_link_that_leads_out_is_refused(folder, tmp_path, in_process):
     copy = tmp_path / "copy"
     shutil.copytree(folder, copy)

@@ -46,7 +46,6 @@ COPIED = (
     RunDirectory.PROOF,
     RunDirectory.BOUND,
     RunDirectory.METRICS,
-    RunDirectory.MACHINE,
     RunDirectory.FIGURES,
 )
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from pirl_rl.assembly import make_evaluation_simulator
@@ -87,8 +88,9 @@ class Contents:
         Raises:
             PirlError: the directory holds no run that can be opened, a link leads out of it, or a file is broken.
         """
-        directory, run = RunDirectory(folder), load_run(folder, trust, problem=problem)
+        directory = RunDirectory(folder)
         directory.refuse_links()
+        run = load_run(folder, trust, problem=problem)
         networks = digest(run.solution.arrays())
         drawn = sorted(directory.figures.glob("*.png"))
         try:
@@ -185,7 +187,9 @@ def _metrics(directory: RunDirectory) -> dict[str, np.ndarray]:
 
 
 def _overrides(directory: RunDirectory) -> list[str]:
-    if not directory.overrides.is_file():
+    """The overrides of the command line that began the run; none where there is no readable record."""
+    try:
+        found = yaml.safe_load(directory.overrides.read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError):
         return []
-    found = OmegaConf.to_container(OmegaConf.load(directory.overrides), resolve=False)
     return [str(entry) for entry in found] if isinstance(found, list) else []

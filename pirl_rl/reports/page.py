@@ -10,16 +10,17 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, UndefinedError
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
-from pirl_rl.errors import ArgumentError
+from pirl_rl.errors import ArgumentError, RunError
 from pirl_rl.files import replacing
 from pirl_rl.machine import version_of
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.reports.contents import Budget, Contents
 from pirl_rl.reports.packing import compressed
+from pirl_rl.run_directory import RunDirectory
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -28,6 +29,9 @@ LARGEST = 5_000_000
 
 MAPS, PICTURES = 3_200_000, 900_000
 """The budget of all runs of a page: bytes of maps before compression, and characters of pictures."""
+
+SHARES = (1.0, 0.5, 0.2)
+"""The shares of the budget that are tried until the page is small enough."""
 
 MOST_RUNS = 6
 """The largest number of runs side by side; with more, each would have too little of the page."""
@@ -68,18 +72,19 @@ def write_report(
 
     Raises:
         ArgumentError: there is no run, or there are too many.
-        PirlError: a directory holds no run that can be opened, a link leads out of it, or a file is broken.
+        PirlError: a directory holds no run that can be opened, a link leads out of it, a file is broken, or the page
+            would be too large.
         OSError: the file cannot be written.
     """
     if not 1 <= len(folders) <= MOST_RUNS:
         raise ArgumentError(f"run: expected 1 to {MOST_RUNS} run directories, got {len(folders)}")
-    share = 1.0
-    while True:
+    for share in SHARES:
         budget = Budget(int(share * MAPS / len(folders)), int(share * PICTURES / len(folders)))
         text = render([Contents.of(Path(folder), budget, trust, problem) for folder in folders], trust)
-        if len(text.encode()) <= LARGEST or share < 0.1:
+        if len(text.encode()) <= LARGEST:
             break
-        share /= 2
+    else:
+        raise RunError(f"report: expected a page of at most {LARGEST:,} bytes, got {len(text.encode()):,}")
     path = Path(out)
     with replacing(path) as file:
         file.write(text)
@@ -87,7 +92,11 @@ def write_report(
 
 
 def render(runs: Sequence[Contents], trust: Sequence[str] = ()) -> str:
-    """The page as text."""
+    """The page as text.
+
+    Raises:
+        RunError: a certificate or a proof lacks an entry.
+    """
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
         autoescape=True,
@@ -95,19 +104,23 @@ def render(runs: Sequence[Contents], trust: Sequence[str] = ()) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"shown": shown, "lines": str.splitlines}
+    environment.filters["lines"] = str.splitlines
     library = get_plotlyjs()
     script = "\n".join((TEMPLATES / name).read_text(encoding="utf-8") for name in SCRIPTS)
-    return environment.get_template("page.html.j2").render(
-        runs=runs,
-        entry=entry,
-        trust=trust,
-        version=version_of("pirl_rl"),
-        style=Markup((TEMPLATES / "page.css").read_text(encoding="utf-8")),
-        script=Markup(script),
-        library=Markup(compressed(library.encode())),
-        hashes=[_hash(script), _hash(library)],
-    )
+    try:
+        return environment.get_template("page.html.j2").render(
+            runs=runs,
+            entry=entry,
+            trust=trust,
+            version=version_of("pirl_rl"),
+            style=Markup((TEMPLATES / "page.css").read_text(encoding="utf-8")),
+            script=Markup(script),
+            library=Markup(compressed(library.encode())),
+            hashes=[_hash(script), _hash(library)],
+        )
+    except UndefinedError as error:
+        names = " or ".join(str(name) for name in (RunDirectory.CERTIFICATE, RunDirectory.PROOF))
+        raise RunError(f"report: expected all entries of {names}, got one without: {error}") from error
 
 
 def _hash(script: str) -> str:
