@@ -10,7 +10,7 @@ the physics is written down; networks, environments and integration are elsewher
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, Literal
 
 import torch
@@ -40,11 +40,16 @@ class ReachAvoidProblem(ABC):
             in which this box is [-1, 1]^m.
         objective: "reach-avoid", or "invariance", where only B absorbs and V(0, x) = 1 outside B.
         payoff: the indicator of A or a smoothing of it.
+        state_names: names of the coordinates of the state with their units, such as "v_x (m/s)", for figures and the
+            report; without them they are x_1, x_2 and so on.
+        control_names: the same for the control; without them they are u_1, u_2 and so on.
     """
 
     horizon: float
     states: Box
     controls: Box
+    state_names: Sequence[str] = ()
+    control_names: Sequence[str] = ()
     objective: ClassVar[Literal["reach-avoid", "invariance"]] = "reach-avoid"
     payoff: Payoff = Indicator()
 
@@ -189,8 +194,9 @@ def check_problem(problem: ReachAvoidProblem, points: int = 100_000, seed: int =
         seed: the seed of these states.
 
     Raises:
-        ProblemError: an attribute is missing, the horizon is not positive or not finite, a control is periodic, an
-            output has the wrong shape or differs at both ends of a period, or a sampled state lies in both A and B.
+        ProblemError: an attribute is missing, the horizon is not positive or not finite, a control is periodic, names
+            of coordinates are not as many as the coordinates, an output has the wrong shape or differs at both ends of
+            a period, or a sampled state lies in both A and B.
     """
     name = type(problem).__name__
     for attribute in ("horizon", "states", "controls"):
@@ -200,6 +206,10 @@ def check_problem(problem: ReachAvoidProblem, points: int = 100_000, seed: int =
         raise ProblemError(f"{name}: horizon must be positive and finite, got {problem.horizon}")
     if problem.controls.periodic:
         raise ProblemError(f"{name}.controls: only states may be periodic, got {problem.controls}")
+    for attribute, box in (("state_names", problem.states), ("control_names", problem.controls)):
+        names = getattr(problem, attribute)
+        if names and (isinstance(names, str) or [type(entry) for entry in names] != [str] * box.dim):
+            raise ProblemError(f"{name}.{attribute}: expected {box.dim} names, got {names!r}")
     rng = torch.Generator().manual_seed(seed)
     x = problem.states.expand(1.5).sample(points, rng, dtype=torch.float64)
     u = problem.controls.sample(16, rng, dtype=torch.float64)

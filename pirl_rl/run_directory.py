@@ -2,6 +2,7 @@
 
 .hydra/config.yaml      the configuration, with the number of its format
 .hydra/overrides.yaml   the overrides of the command line
+.hydra/machine.json     the commands, versions and machines that made the run
 .hydra/lock             held by the process that writes into the directory, which .hydra/holder names
 metrics.csv             one row of metrics for each logged update
 summary.json            the verdict, the metrics of the final evaluation, and the length of the training
@@ -11,6 +12,7 @@ proof.json, proof.npz   what `python -m pirl_rl.certify method=interval` proved,
 checkpoints/            last.pt, from which the run can be resumed, and weights-<update>.pt with the networks
 grid.npz                the value and the policy on a mesh, in place of checkpoints, of a run with method=grid
 figures/                PNG files
+report.html             the run on one page, drawn from the other files
 """
 
 from __future__ import annotations
@@ -34,6 +36,7 @@ class RunDirectory:
 
     CONFIG = Path(".hydra", "config.yaml")
     OVERRIDES = Path(".hydra", "overrides.yaml")
+    MACHINE = Path(".hydra", "machine.json")
     LOCK = Path(".hydra", "lock")
     HOLDER = Path(".hydra", "holder")
     METRICS = Path("metrics.csv")
@@ -46,6 +49,7 @@ class RunDirectory:
     LAST = CHECKPOINTS / "last.pt"
     GRID = Path("grid.npz")
     FIGURES = Path("figures")
+    REPORT = Path("report.html")
 
     def __init__(self, path: str | os.PathLike[str]):
         self.path = Path(path)
@@ -78,6 +82,11 @@ class RunDirectory:
     @property
     def overrides(self) -> Path:
         return self.path / self.OVERRIDES
+
+    @property
+    def machine(self) -> Path:
+        """The record of how the run was made."""
+        return self.path / self.MACHINE
 
     @property
     def lock(self) -> Path:
@@ -135,6 +144,10 @@ class RunDirectory:
     @property
     def figures(self) -> Path:
         return self.path / self.FIGURES
+
+    @property
+    def report(self) -> Path:
+        return self.path / self.REPORT
 
     def weights(self, update: int) -> Path:
         """The file with the networks after an update."""

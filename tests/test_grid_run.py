@@ -47,6 +47,8 @@ def test_a_grid_leaves_a_run_directory(run, folder):
         "calibration.png",
     }
     assert summary["verdict"] == "solved"
+    assert summary["verdict_lines"].startswith("verdict   solved: ")
+    assert "method=grid" in (folder / "report.html").read_text()
 
 
 def test_its_run_answers_like_any_other(run, folder):

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from pirl_rl import progress
 from pirl_rl.commands import catalogue
 
-COMMANDS = ("train", "check", "evaluate", "certify", "tune", "export", "compare", "sweeps", "suite")
+COMMANDS = ("train", "check", "evaluate", "certify", "tune", "export", "report", "compare", "sweeps", "suite")
 
 
 @pytest.mark.parametrize("name", COMMANDS)

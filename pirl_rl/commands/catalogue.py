@@ -24,6 +24,7 @@ COMMANDS = (
         "python -m pirl_rl.certify run=RUN_DIR",
         "bound the success of a policy and the error of its V",
     ),
+    ("python -m pirl_rl.report run=RUN_DIR", "draw the report of a run, or of several side by side"),
     ("python -m pirl_rl.tune +experiment=reach1d start=RUN_DIR", "continue a run in rounds that an advisor plans"),
     ("python -m pirl_rl.export run=RUN_DIR out=FOLDER", "copy the networks and the results of a run"),
     ("python -m pirl_rl.compare RUN_DIRS", "compare runs in one table and one figure"),

@@ -5,7 +5,7 @@
 
 Plays new paths of the policy, and writes what follows from them, whatever the law of the paths is, to certificate.json
 in the run directory. A certificate counts if it is made once: `picked_from` is the number of runs, or of seeds, out of
-which the best one is shown.
+which the best one is shown. The report of the run is drawn again.
 
 With method=interval it proves a lower bound of the probability of success for all states at once, with certainty, and
 writes it to proof.json and proof.npz. The bound is about continuous feedback, and the statistical claims are about the
@@ -55,6 +55,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from pirl_rl.commands.console import quiet_libraries, reported
+from pirl_rl.commands.report import draw_again
 from pirl_rl.errors import ConfigError
 from pirl_rl.files import replacing
 from pirl_rl.progress import announce, helped
@@ -84,10 +85,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         methods = [item.partition("=")[2] for item in others if item.startswith("method=")]
         method = methods[-1] if methods else "statistical"
         settings = _settings(method, [item for item in others if not item.startswith("method=")])
-        run, directory = load_run(folder, settings.pop("trust", ())), RunDirectory(folder)
+        trust = settings.pop("trust", ())
+        run, directory = load_run(folder, trust), RunDirectory(folder)
         directory.refuse_links()
         lines = _prove(run, directory, settings) if method == "interval" else _certify(run, directory, settings)
     print("\n".join(lines))
+    if run.config.get("report", True):
+        draw_again(folder, trust)
 
 
 def _certify(run: Run, directory: RunDirectory, settings: dict[str, Any]) -> list[str]:

@@ -3,7 +3,7 @@
     python -m pirl_rl.evaluate run=RUN_DIR [key=value ...]
 
 Calls the final evaluators of the run, writes their metrics and the verdict to evaluation.json in the run directory, and
-draws its figures.
+draws its figures and its report.
 
     run           the directory of a finished run
     verbose=true  prints all metrics with their meaning
@@ -26,6 +26,7 @@ from omegaconf import open_dict
 
 from pirl_rl.assembly import make_evaluation_simulator, make_evaluators
 from pirl_rl.commands.console import named_modules, outcome, override, reported
+from pirl_rl.commands.report import draw_again
 from pirl_rl.configuration import load_config
 from pirl_rl.errors import ConfigError
 from pirl_rl.evaluation import evaluate, lines_of, meanings_of, metrics_of, statements_of
@@ -50,7 +51,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         config = load_config(folder)
         config.trust = []
         with open_dict(config):
-            config.setdefault("verbose", False)  # older runs have no such setting
+            for name, value in (("verbose", False), ("report", True)):  # older runs have no such settings
+                config.setdefault(name, value)
         for text in overrides:
             override(config, text)
         trust = [*config.trust, *named_modules(overrides)]
@@ -68,3 +70,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for figure in figures:
         print(f"figure   {figure}")
     print(f"written  {run.evaluation}")
+    if config.report:
+        draw_again(folder, trust)

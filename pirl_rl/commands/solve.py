@@ -20,18 +20,15 @@ from pirl_rl.assembly import (
     make_problem,
 )
 from pirl_rl.commands.console import outcome
+from pirl_rl.commands.report import draw_again
 from pirl_rl.configuration import save_config
 from pirl_rl.evaluation import evaluate, lines_of, meanings_of, metrics_of, statements_of
 from pirl_rl.figures import draw_run
 from pirl_rl.files import replacing
+from pirl_rl.machine import record_session
 from pirl_rl.problem import ReachAvoidProblem, check_problem
+from pirl_rl.reports.meanings import GRID
 from pirl_rl.run_directory import RunDirectory
-
-MEANINGS = {
-    "wall_seconds": "The time of the solution, in s.",
-    "grid_nodes": "The number of nodes of the mesh.",
-    "grid_error": "The largest difference at tau = T from the solution with half as many points and steps.",
-}
 
 
 def solve(
@@ -66,6 +63,7 @@ def solve(
     seconds = time.perf_counter() - started
     save_config(config, folder)
     OmegaConf.save(overrides, run.overrides)
+    record_session(run, overrides, "cpu")
     solution.save(run.grid)
     evaluators = make_evaluators(config.evaluation, "final", trust)
     evidence = evaluate(solution, make_evaluation_simulator(config, problem), evaluators)
@@ -74,9 +72,11 @@ def solve(
     summary |= metrics_of(evidence)
     with replacing(run.summary) as file:
         file.write(json.dumps(statements_of(evidence) | summary, indent=2) + "\n")
-    meanings = {"grid": MEANINGS} | meanings_of(evaluators, problem)
+    meanings = {"grid": GRID} | meanings_of(evaluators, problem)
     print(outcome(lines_of(evidence), summary, meanings, config.verbose))
     for figure in draw_run(solution, run.metrics, run.figures, evidence):
         print(f"figure   {figure}")
+    if config.report:
+        draw_again(folder, trust, problem)
     print(f"run      {run}")
     return summary

@@ -37,6 +37,7 @@ from pirl_rl.commands.check import check_before_training
 from pirl_rl.commands.composition import check_overrides, drop_leftovers, register
 from pirl_rl.commands.console import named_modules, outcome, override, quiet_libraries, reported
 from pirl_rl.commands.methods import check_method, method_of
+from pirl_rl.commands.report import draw_again
 from pirl_rl.commands.solve import solve
 from pirl_rl.configuration import CONF, PACKAGE, load_config, save_config
 from pirl_rl.continuation import restore, start_from
@@ -44,8 +45,10 @@ from pirl_rl.errors import INTERRUPTED, CheckpointError, ConfigError
 from pirl_rl.evaluation import lines_of, meanings_of
 from pirl_rl.figures import draw_run
 from pirl_rl.lock import locked
+from pirl_rl.machine import record_session
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.progress import announce, helped
+from pirl_rl.reports.meanings import TRAINING
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.trainer import Trainer
 
@@ -103,7 +106,8 @@ def train_new(
             _start(trainer, config)
         save_config(config, folder)
         OmegaConf.save(overrides, RunDirectory(folder).overrides)
-        return _train(trainer, config.verbose)
+        record_session(RunDirectory(folder), overrides, trainer.solution.device)
+        return _train(trainer, config, trust)
 
 
 def resume(folder: Path, overrides: Sequence[str]) -> None:
@@ -123,7 +127,8 @@ def resume(folder: Path, overrides: Sequence[str]) -> None:
                 print(f"resume: {text.partition('=')[0]} was {before}, and is {after} from now on", flush=True)
         if config.get("grid") is not None:
             raise ConfigError(f"resume: expected a run that was trained, but {folder} holds the solution of a grid")
-        trainer = make_trainer(config, folder, [*config.trust, *named_modules(overrides)])
+        modules = [*config.trust, *named_modules(overrides)]
+        trainer = make_trainer(config, folder, modules)
         if run.last.exists():
             restore(trainer)
         else:
@@ -131,7 +136,8 @@ def resume(folder: Path, overrides: Sequence[str]) -> None:
             if config.get("start") is not None:
                 _start(trainer, config)
         save_config(config, folder)
-        _train(trainer, config.get("verbose", False))
+        record_session(run, [f"resume={folder.name}", *overrides], trainer.solution.device)
+        _train(trainer, config, modules)
 
 
 def _start(trainer: Trainer, config: DictConfig) -> None:
@@ -159,14 +165,16 @@ def _start(trainer: Trainer, config: DictConfig) -> None:
         ) from None
 
 
-def _train(trainer: Trainer, verbose: bool) -> dict[str, float]:
+def _train(trainer: Trainer, config: DictConfig, trust: Sequence[str]) -> dict[str, float]:
     summary = trainer.train()
     assert trainer.folder is not None
     run = RunDirectory(trainer.folder)
-    meanings = meanings_of(trainer.final, trainer.solution.problem)
-    print(outcome(lines_of(trainer.evidence), summary, meanings, verbose))
+    meanings = {"training": TRAINING} | meanings_of(trainer.final, trainer.solution.problem)
+    print(outcome(lines_of(trainer.evidence), summary, meanings, config.get("verbose", False)))
     for figure in draw_run(trainer.solution, run.metrics, run.figures, trainer.evidence):
         print(f"figure   {figure}")
+    if config.get("report", True):
+        draw_again(run.path, trust, trainer.solution.problem)
     print(f"run      {run}")
     return summary
 

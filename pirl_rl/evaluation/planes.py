@@ -53,7 +53,18 @@ def coordinate_plane(problem: ReachAvoidProblem, first: int, second: int, base: 
         return x
 
     box = Box([states.low[i] for i in pair], [states.high[i] for i in pair], periodic)
-    return Plane((f"$x_{{{first + 1}}}$", f"$x_{{{second + 1}}}$"), box, embed, lambda x: x[..., pair])
+    names = problem.state_names or [f"$x_{{{i + 1}}}$" for i in range(states.dim)]
+    return Plane((names[first], names[second]), box, embed, lambda x: x[..., pair])
+
+
+def slopes_of(solution: Solution) -> Tensor:
+    """The mean of |dV/dx_i| (n,) over the box at tau = T, with each coordinate in units of half of its width."""
+    problem = solution.problem
+    x = problem.states.sample(STATES, torch.Generator().manual_seed(0), torch.float64)
+    x = x[problem.interior(x)]
+    tau, x = like(solution, torch.full((len(x),), problem.horizon), x)
+    slope = solution.gradient(tau, x) * problem.states.center_and_half_width(x)[1]
+    return slope.abs().mean(0)
 
 
 def _base(problem: ReachAvoidProblem) -> Tensor:
@@ -75,11 +86,6 @@ def _base(problem: ReachAvoidProblem) -> Tensor:
 
 def _steepest(solution: Solution) -> tuple[int, int]:
     """The pair of coordinates, other than the first two, with the largest mean slopes of V across the box."""
-    problem = solution.problem
-    x = problem.states.sample(STATES, torch.Generator().manual_seed(0), torch.float64)
-    x = x[problem.interior(x)]
-    tau, x = like(solution, torch.full((len(x),), problem.horizon), x)
-    slope = solution.gradient(tau, x) * problem.states.center_and_half_width(x)[1]
-    order = slope.abs().mean(0).argsort(descending=True).tolist()
+    order = slopes_of(solution).argsort(descending=True).tolist()
     pair = order[:2] if {*order[:2]} != {0, 1} else [order[0], order[2]]
     return min(pair), max(pair)

@@ -59,10 +59,11 @@ class VerdictEvidence:
         }
 
     def statements(self) -> dict[str, str]:
-        """The verdict and its reason, for the summary."""
+        """The verdict, its reason and its lines, for the summary."""
         reasons = judge(self.measures)
         level, why = verdict_of(reasons)
-        return {"verdict": level, "verdict_reason": " ".join([why, *(reason.why for reason in reasons[1:])])}
+        every = " ".join([why, *(reason.why for reason in reasons[1:])])
+        return {"verdict": level, "verdict_reason": every, "verdict_lines": "\n".join(self.lines())}
 
     def lines(self) -> list[str]:
         """The verdict in at most eight lines."""

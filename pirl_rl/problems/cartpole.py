@@ -25,6 +25,8 @@ class CartPole(ReachAvoidProblem):
     horizon = 2.0
     states = Box([-2.4, -4.0, -math.pi / 15, -3.0], [2.4, 4.0, math.pi / 15, 3.0])
     controls = Box([-10.0], [10.0])
+    state_names = ("p (m)", "v (m/s)", "theta (rad)", "omega (rad/s)")
+    control_names = ("F (N)",)
     gravity = 9.8  # m/s^2
     cart_mass = 1.0  # kg
     pole_mass = 0.1  # kg

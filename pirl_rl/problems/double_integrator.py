@@ -31,6 +31,8 @@ class DoubleIntegrator(ReachAvoidProblem):
     horizon = 3.0
     states = Box([-1.0, -1.0], [1.0, 1.0])
     controls = Box([-1.0], [1.0])
+    state_names = ("p (m)", "v (m/s)")
+    control_names = ("u (m/s^2)",)
     tolerance = 0.2  # m and m/s, half of the target's widths
     limit = 1.0  # m and m/s, of |p| and |v|
 

@@ -22,6 +22,8 @@ class DubinsCar(ReachAvoidProblem):
     horizon = 4.0
     states = Box([-2.0, -2.0, -math.pi], [2.0, 2.0, math.pi], periodic=[2])
     controls = Box([-1.5], [1.5])
+    state_names = ("x_1 (m)", "x_2 (m)", "theta (rad)")
+    control_names = ("u (rad/s)",)
     speed = 1.0  # m/s
     noise = (0.1, 0.1, 0.3)  # m, m and rad per sqrt(s)
     target, target_radius = (1.2, 0.0), 0.3  # m

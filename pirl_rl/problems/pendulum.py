@@ -24,6 +24,8 @@ class Pendulum(ReachAvoidProblem):
     horizon = 2.0
     states = Box([-0.6, -2.5], [0.6, 2.5])
     controls = Box([-2.0], [2.0])
+    state_names = ("theta (rad)", "omega (rad/s)")
+    control_names = ("u (N m)",)
     gravity = 10.0  # m/s^2
     mass = 1.0  # kg
     length = 1.0  # m

@@ -28,6 +28,8 @@ class PlanarQuadrotor(ReachAvoidProblem):
     inertia = 0.00383  # kg m^2
     states = Box([-2.0, 0.0, -1.0, -2.0, -2.0, -5.0], [2.0, 2.0, 1.0, 2.0, 2.0, 5.0])
     controls = Box([0.0, 0.0], [mass * gravity, mass * gravity])  # each rotor lifts at most the weight
+    state_names = ("x (m)", "z (m)", "theta (rad)", "x' (m/s)", "z' (m/s)", "theta' (rad/s)")
+    control_names = ("u_1 (N)", "u_2 (N)")
     hover = (0.0, 1.0, 0.0, 0.0, 0.0, 0.0)  # the middle of the target
     tolerances = (0.3, 0.3, 0.2, 0.5, 0.5, 1.5)  # half of the target's widths
     limits = (2.0, 1.0, 1.2)  # m, m and rad, of |x|, |z - 1| and |theta|; B is beyond

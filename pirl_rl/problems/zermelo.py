@@ -24,6 +24,8 @@ class ZermeloBoat(ReachAvoidProblem):
     horizon = 4.0
     states = Box([-2.0, -1.0], [2.0, 1.0])
     controls = Box([-0.8, -0.8], [0.8, 0.8])
+    state_names = ("x_1 (m)", "x_2 (m)")
+    control_names = ("u_1 (m/s)", "u_2 (m/s)")
     current = 1.0  # m/s, in the middle of the river; at the banks, x_2 = -1 m and 1 m, it is 0
     noise = (0.3, 0.3)  # m per sqrt(s)
     landing, landing_radius = (1.4, 0.4), 0.3  # m

@@ -23,7 +23,10 @@ LISTED = 20
 """The largest number of boxes that resist which are listed for each condition."""
 
 EVALUATION = 1e-9
-"""A bound of the rounding errors in the value of a spline at a point, and by how much states may leave the box."""
+"""A bound of the rounding errors in the value of a spline at a point."""
+
+BEYOND = 1e-6
+"""The share of the box's width by which points may lie beyond it, for states in single precision."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,8 @@ class Proof:
         """
         points = np.column_stack([tau, x])
         low, high = (np.array([axis[end] for axis in self.spline.edges]) for end in (0, -1))
-        beyond = ~((points >= low - EVALUATION) & (points <= high + EVALUATION)).all(-1)
+        reach = BEYOND * (high - low)
+        beyond = ~((points >= low - reach) & (points <= high + reach)).all(-1)
         if beyond.any():
             raise ProofError(
                 f"bound: expected (tau, x) between {low.tolist()} and {high.tolist()}, got {points[beyond][0].tolist()}"

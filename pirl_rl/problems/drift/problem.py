@@ -33,6 +33,8 @@ class VehicleDrift(ReachAvoidProblem):
     horizon = 5.0
     states = Box([-2.0, -0.8, 4.0, -8.0, -2.5, -0.7, 0.5], [2.0, 0.8, 12.0, 8.0, 2.5, 0.7, 0.6])
     controls = Box([-1.5, 1000.0], [1.5, 5000.0])
+    state_names = ("e_y (m)", "e_psi (rad)", "v_x (m/s)", "v_y (m/s)", "r (rad/s)", "delta (rad)", "mu")
+    control_names = ("delta' (rad/s)", "F_x (N)")
     tolerances = {"e_y": 0.2, "e_psi": 4 * DEGREE, "v_x": 0.5, "beta": 4 * DEGREE, "r": 0.2, "delta": 10 * DEGREE}
     limits = {"e_y": 2.0, "e_psi": 0.8, "v_y": 12.0, "r": 2.5, "delta": 0.7}  # of absolute values; B is beyond
     speeds = (3.0, 25.0)  # m/s, the range of v_x outside of B

@@ -41,6 +41,8 @@ class VehicleDrift3(ReachAvoidProblem):
     horizon = 5.0
     states = Box([-math.pi / 4, -2.5, 4.0], [math.pi / 4, 2.5, 12.0])
     controls = Box([-0.7, 1000.0], [0.7, 5000.0])
+    state_names = ("beta (rad)", "r (rad/s)", "v_x (m/s)")
+    control_names = ("delta (rad)", "F_x (N)")
     tolerances = {name: VehicleDrift.tolerances[name] for name in ("beta", "r", "v_x")}
     # In units of the state per sqrt(s). Noise of 0.20 m/s in v_y is noise of 0.20 cos(beta)^2 / v_x in
     # beta = atan2(v_y, v_x). It is taken at beta = 0 and at v_x of the equilibrium, so that sigma is constant.
