@@ -15,6 +15,9 @@ from pirl_rl.proofs.mesh import NEAR, Mesh, product
 SHARPNESS = 2.0
 """The sharpness of the corners of the set in A on whose face W is 1, in relation to the depth of A."""
 
+INSET = 0.1
+"""How deep in A its smooth part lies, in relation to the depth of A: W may be curved sharply between both faces."""
+
 NEWTON_STEPS = 20
 """The number of steps in which a point is moved to a face."""
 
@@ -45,7 +48,7 @@ def smooth_target(problem: ReachAvoidProblem, x: Tensor) -> Level:
     if not len(inside):
         raise ProofError("proof: no point of the mesh lies in the target; give more cells")
     depth = -inside.amin(0)
-    return lambda states: torch.logsumexp(SHARPNESS * problem.reached_constraints(states) / depth, -1)
+    return lambda states: torch.logsumexp(SHARPNESS * (problem.reached_constraints(states) / depth + INSET), -1)
 
 
 def face_points(level: Level, mesh: Mesh, x: np.ndarray) -> np.ndarray:

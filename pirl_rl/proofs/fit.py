@@ -53,12 +53,7 @@ class Fit:
 
     def __init__(self, equation: Equation, policy: Policy, margin: float):
         self.equation, self.mesh, self.margin = equation, equation.mesh, margin
-        problem, x = equation.problem, product(self.mesh.points(PLACES))
-        states = torch.from_numpy(x)
-        ended = problem.failed(states)
-        if problem.objective == "reach-avoid":
-            ended = ended | problem.reached(states)
-        self._points = Points(problem, policy, self.mesh, x[~ended.numpy()])
+        self._points = Points(equation.problem, policy, self.mesh, self._checked(product(self.mesh.points(PLACES))))
         self._cells = self.mesh.cell_of(self._points.x)
         self._own_cells = self.mesh.cell_of(equation.points.x)
         taus = self.mesh.taus
@@ -66,6 +61,16 @@ class Fit:
         self._rates = [(tau, *self._points.rates(tau)) for tau in times]
         self._source = np.full((len(taus), len(equation.points.x)), LEAST)
         self.spline = equation.solve(self._source)
+
+    def _checked(self, x: np.ndarray) -> np.ndarray:
+        """Those of states (N, n) that lie in cells which are not entirely in A or B."""
+        problem, states = self.equation.problem, torch.from_numpy(x)
+        ended = problem.failed(states)
+        if problem.objective == "reach-avoid":
+            ended = ended | problem.reached(states)
+        going_on = np.zeros(self.mesh.cells[1:], bool)
+        going_on[self.mesh.cell_of(x[~ended.numpy()])] = True
+        return x[going_on[self.mesh.cell_of(x)]]
 
     def at_points(self, rounds: int) -> None:
         """Raise the source until L^pi W is what the fit aims at in all cells, or `rounds` times.
