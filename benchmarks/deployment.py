@@ -1,13 +1,16 @@
-"""Time of one state, and distance from the run, of an exported ONNX model, in onnxruntime on one thread.
+"""Time of one state, and distance from the run, of exported ONNX models, in onnxruntime on one thread.
 
     python -m pirl_rl.export run=RUN_DIR out=FOLDER format=onnx
-    python benchmarks/deployment.py RUN_DIR FOLDER [--calls 20000] [--states 10000]
+    python benchmarks/deployment.py RUN_DIR FOLDER [RUN_DIR FOLDER ...] [--calls 30000] [--states 10000]
 
-The time is that of a call from Python with one state; its quantiles are over the calls, each with another state. The
-time of the processor leaves out the waits for other processes on a machine that is shared. The distance is the largest
-over states, half of them on the faces of A and B: that of V, and those of gradient and control as shares of the largest
-gradient and of the width of the control's range. States at which the masks differ, because the level of a state on a
-face is rounded to the other side, are counted apart.
+The time is that of a call from Python with one state; its quantiles are over the calls, each with another state. Models
+take turns, in blocks of 500 calls, so that all of them see the same machine. The time of the processor leaves out the
+waits for other processes on a machine that is shared, but not the cold caches that these leave behind; the quietest
+block, the one with the lowest 99th percentile, shows the model alone.
+
+The distance is the largest over states, half of them on the faces of A and B: that of V, and those of gradient and
+control as shares of the largest gradient and of the width of the control's range. States at which the masks differ,
+because the level of a state on a face is rounded to the other side, are counted apart.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from __future__ import annotations
 import argparse
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import onnxruntime
@@ -23,6 +27,31 @@ import torch
 from pirl_rl import load_run
 from pirl_rl.runs.run import Run
 from pirl_rl.sampling.faces import find_faces
+
+BLOCK = 500
+
+
+class Model(NamedTuple):
+    """A session, and times to go (N,) and states (N, n) to evaluate."""
+
+    folder: Path
+    session: onnxruntime.InferenceSession
+    tau: np.ndarray
+    x: np.ndarray
+
+    @property
+    def outputs(self) -> list[str]:
+        return [output.name for output in self.session.get_outputs()]
+
+    def block(self) -> np.ndarray:
+        """Elapsed and processor times (BLOCK, 2) of calls with one state each, in microseconds."""
+        times, names = np.empty((BLOCK, 2)), self.outputs
+        for i in range(BLOCK):
+            one = {"tau": self.tau[i : i + 1], "x": self.x[i : i + 1]}
+            started, began = time.perf_counter(), time.thread_time()
+            self.session.run(names, one)
+            times[i] = time.perf_counter() - started, time.thread_time() - began
+        return 1e6 * times
 
 
 def session_of(model: Path) -> onnxruntime.InferenceSession:
@@ -40,35 +69,40 @@ def points(run: Run, count: int) -> tuple[np.ndarray, np.ndarray]:
     return (run.problem.horizon * torch.rand(count, generator=rng)).numpy(), x.numpy()
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--calls", type=int, default=20_000)
-    parser.add_argument("--states", type=int, default=10_000)
-    arguments = parser.parse_args()
-    run, session = load_run(arguments.run), session_of(arguments.folder / "model.onnx")
-    tau, x = points(run, arguments.states)
-
-    names = [output.name for output in session.get_outputs()]
-    answer = dict(zip(names, session.run(names, {"tau": tau, "x": x}), strict=True))
+def compare(model: Model, run: Run) -> None:
+    """Print how far the numbers of a model are from those of its run."""
+    tau, x = model.tau, model.x
+    answer = dict(zip(model.outputs, model.session.run(model.outputs, {"tau": tau, "x": x}), strict=True))
     value, gradient, control = run.value(tau, x), run.gradient(tau, x), run.policy(tau, x)
     width = np.subtract(run.problem.controls.high, run.problem.controls.low)
     masked = np.isin(answer["value"], (0, 1)) != np.isin(value, (0, 1))
-    print(f"value     {np.abs(answer['value'] - value)[~masked].max():.1e}, and {masked.sum()} masks differ")
-    print(f"gradient  {np.abs(answer['gradient'] - gradient).max() / np.abs(gradient).max():.1e} of the largest")
-    print(f"control   {(np.abs(answer['control'] - control) / width).max():.1e} of the range")
+    print(f"{model.folder}")
+    print(f"  value     {np.abs(answer['value'] - value)[~masked].max():.1e}, and {masked.sum()} masks differ")
+    print(f"  gradient  {np.abs(answer['gradient'] - gradient).max() / np.abs(gradient).max():.1e} of the largest")
+    print(f"  control   {(np.abs(answer['control'] - control) / width).max():.1e} of the range")
 
-    wall, busy = np.empty((2, arguments.calls))
-    for i in range(arguments.calls):
-        k = i % len(x)
-        one = {"tau": tau[k : k + 1], "x": x[k : k + 1]}
-        started, began = time.perf_counter(), time.thread_time()
-        session.run(names, one)
-        wall[i], busy[i] = time.perf_counter() - started, time.thread_time() - began
-    for name, times in (("elapsed", wall), ("processor", busy)):
-        median, high = 1e6 * np.quantile(times[len(times) // 10 :], [0.5, 0.99])
-        print(f"{name:<10}{median:.0f} us for one state in the median, {high:.0f} us at the 99th percentile")
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("pairs", type=Path, nargs="+", metavar="RUN_DIR FOLDER")
+    parser.add_argument("--calls", type=int, default=30_000)
+    parser.add_argument("--states", type=int, default=10_000)
+    arguments = parser.parse_args()
+    models = []
+    for place, folder in zip(arguments.pairs[::2], arguments.pairs[1::2], strict=True):
+        run = load_run(place)
+        models.append(Model(folder, session_of(folder / "model.onnx"), *points(run, arguments.states)))
+        compare(models[-1], run)
+    rounds = [[model.block() for model in models] for _ in range(1 + arguments.calls // BLOCK)][1:]
+    for model, blocks in zip(models, np.array(rounds).swapaxes(0, 1), strict=True):
+        print(f"{model.folder}, microseconds for one state")
+        for name, times in zip(("elapsed", "processor"), np.moveaxis(blocks, -1, 0), strict=True):
+            median, high = np.quantile(times, [0.5, 0.99])
+            quiet = times[np.quantile(times, 0.99, axis=1).argmin()]
+            print(
+                f"  {name:<10}median {median:.0f}, 99th percentile {high:.0f}; in the quietest block "
+                f"{np.median(quiet):.0f} and {np.quantile(quiet, 0.99):.0f}"
+            )
 
 
 if __name__ == "__main__":

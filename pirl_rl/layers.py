@@ -80,6 +80,10 @@ class Levels(nn.Module):
         super().__init__()
         self.levels, self.states = levels, states
 
+    def __deepcopy__(self, memo: dict) -> Levels:
+        """Copies of a network share the problem, whose levels are then the same function in all of them."""
+        return Levels(self.levels, self.states)
+
     def of(self, x: Tensor) -> Tensor:
         """The states (*, n) in inputs (*, d)."""
         # A view of the inputs cannot be differentiated twice in forward mode by compiled code.

@@ -6,22 +6,27 @@ import json
 import shutil
 import subprocess
 import sys
+from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from small import small_config
+from torch.fx.experimental.proxy_tensor import make_fx
 
 from pirl_rl import Box, ReachAvoidProblem, load_run
 from pirl_rl.checkpoint import digest
 from pirl_rl.commands.export import export_model, main
 from pirl_rl.configuration import save_config
 from pirl_rl.deployment import Program, describe, write_model
+from pirl_rl.deployment.graph import record
+from pirl_rl.deployment.simplify import simplify
 from pirl_rl.errors import ArgumentError, ConfigError
+from pirl_rl.layers import Levels
 from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.payoffs import LipschitzPayoff
-from pirl_rl.problems import DubinsCar, Pendulum, PlanarQuadrotor
+from pirl_rl.problems import DubinsCar, Pendulum, PlanarQuadrotor, Reach1D
 from pirl_rl.problems.drift.problem import VehicleDrift
 from pirl_rl.sampling.faces import find_faces
 from pirl_rl.solution import Solution
@@ -101,14 +106,70 @@ def dubins(tmp_path_factory) -> tuple[Solution, Path]:
         solution_of(PlanarQuadrotor(), root_time=False, levels=False, activation="ReLU", output=None),
         solution_of(Pendulum(), activation="Tanh"),
         solution_of(VehicleDrift()),
+        solution_of(Reach1D(), hidden=()),
     ],
-    ids=["periodic", "smoothed", "plain", "invariance", "unreachable"],
+    ids=["periodic", "smoothed", "plain", "invariance", "unreachable", "no avoid set"],
 )
 def test_the_program_computes_what_the_solution_does(solution):
     """In double precision nothing but rounding differs, of the order of 1e-16 times the slope of the networks."""
     solution = Solution(solution.problem, solution.actor.double(), solution.critic.double())
     tau, x = (entry.double() for entry in points(solution.problem, 2_000))
     assert_answers(Program(solution)(tau, x), solution, tau, x, tolerance=1e-12)
+
+
+class Branching(ReachAvoidProblem):
+    """A level function that asks for the entries of a tensor."""
+
+    horizon = 1.0
+    states, controls = Box([-1.0], [1.0]), Box([-1.0], [1.0])
+
+    def drift(self, x, u):
+        return u
+
+    def diffusion(self, x, u):
+        return torch.ones_like(x).unsqueeze(-1)
+
+    def target_level(self, x):
+        return 0.5 - x[..., 0] if bool((x > 0).any()) else 0.5 - x[..., 0].abs()
+
+
+class InPlace(Branching):
+    """A level function that changes a tensor of its own."""
+
+    def target_level(self, x):
+        level = 0.5 - x[..., 0].abs()
+        level *= 2
+        return level
+
+
+@pytest.mark.parametrize("problem", [VehicleDrift(), InPlace()], ids=["equal parts", "in place"])
+def test_a_graph_has_the_numbers_of_the_solution_and_each_part_once(problem):
+    """Networks and masks look the same levels up, and nothing is multiplied by ones."""
+    solution = solution_of(problem)
+    graph = record(solution)
+    tau, x = points(problem, 500)
+    assert_answers(graph.module()(tau, x), solution, tau, x, TOLERANCE)
+    lines = [f"{node.target} {node.args}" for node in graph.graph.nodes if node.op == "call_function"]
+    assert len(set(lines)) == len(lines)
+    assert not any("ones_like" in line or "_unsafe" in line for line in lines)
+    tables = sum("aten.index" in line for line in lines)
+    assert tables == (2 if isinstance(problem, VehicleDrift) else 0)  # the two knots of the equilibria
+
+
+def test_an_operator_with_side_effects_is_not_simplified():
+    def doubled(x: torch.Tensor) -> torch.Tensor:
+        return x.clone().mul_(2)
+
+    graph = make_fx(doubled)(torch.ones(3)).graph
+    with pytest.raises(ValueError, match="expected operators without side effects, got"):
+        simplify(graph)
+
+
+def test_copies_of_a_network_share_the_problem():
+    actor = solution_of(DubinsCar()).actor
+    one, other = (next(layer for layer in net.layers if isinstance(layer, Levels)) for net in (actor, deepcopy(actor)))
+    assert one is not other
+    assert one.levels is other.levels
 
 
 def test_onnxruntime_evaluates_a_model_without_torch(dubins, tmp_path):
@@ -129,22 +190,6 @@ def test_onnxruntime_evaluates_a_model_without_torch(dubins, tmp_path):
 def test_a_model_names_no_file_of_this_machine(dubins):
     assert str(ROOT).encode() not in dubins[1].read_bytes()
     assert sorted(path.name for path in dubins[1].parent.iterdir()) == ["model.json", "model.onnx"]
-
-
-class Branching(ReachAvoidProblem):
-    """A level function that asks for the entries of a tensor."""
-
-    horizon = 1.0
-    states, controls = Box([-1.0], [1.0]), Box([-1.0], [1.0])
-
-    def drift(self, x, u):
-        return u
-
-    def diffusion(self, x, u):
-        return torch.ones_like(x).unsqueeze(-1)
-
-    def target_level(self, x):
-        return 0.5 - x[..., 0] if bool((x > 0).any()) else 0.5 - x[..., 0].abs()
 
 
 def test_a_problem_that_no_graph_can_hold_is_refused(tmp_path):

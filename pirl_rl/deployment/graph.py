@@ -14,6 +14,7 @@ from torch.export import Dim, ExportedProgram
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from pirl_rl.deployment.program import Program
+from pirl_rl.deployment.simplify import simplify
 from pirl_rl.errors import ArgumentError
 from pirl_rl.solution import Solution
 
@@ -39,7 +40,10 @@ def record(solution: Solution) -> ExportedProgram:
     program(tau, x)
     count = Dim("N", min=1)
     try:
-        graph = make_fx(program, DERIVATIVES, tracing_mode="symbolic", _allow_non_fake_inputs=True)(tau, x)
+        pure = torch.func.functionalize(program)
+        graph = make_fx(pure, SIMPLER, tracing_mode="symbolic", _allow_non_fake_inputs=True)(tau, x)
+        simplify(graph.graph)
+        graph.recompile()
         exported = torch.export.export(graph, (tau, x), dynamic_shapes=({0: count}, {0: count}))
     except Exception as error:
         # What cannot be recorded raises errors of many types.
@@ -60,6 +64,16 @@ def _silu_backward(grad: Tensor, z: Tensor) -> Tensor:
     return grad * (s + z * s * (1 - s))
 
 
+def _sigmoid_backward(grad: Tensor, y: Tensor) -> Tensor:
+    """The derivative of a sigmoid y is y (1 - y)."""
+    return grad * (y * (1 - y))
+
+
+def _tanh_backward(grad: Tensor, y: Tensor) -> Tensor:
+    """The derivative of a hyperbolic tangent y is 1 - y^2."""
+    return grad * (1 - y * y)
+
+
 def _select_backward(grad: Tensor, sizes: Sequence[int], dim: int, index: int) -> Tensor:
     """The gradient (*, d) of an entry of the last axis; other axes are left to torch."""
     if dim % len(sizes) != len(sizes) - 1:
@@ -74,9 +88,23 @@ def _slice_backward(grad: Tensor, sizes: Sequence[int], dim: int, start: int, en
     return torch.matmul(grad, torch.eye(int(sizes[dim]), dtype=grad.dtype)[start:end:step])
 
 
-DERIVATIVES = {
+def _lerp(start: Tensor, end: Tensor, weight: Tensor) -> Tensor:
+    """Linear interpolation by one formula, where torch has one for weights on either side of a half."""
+    return start + weight * (end - start)
+
+
+def _unbind(x: Tensor, dim: int = 0) -> tuple[Tensor, ...]:
+    """The entries along an axis, each by one operator."""
+    return tuple(x.select(dim, i) for i in range(x.shape[dim]))
+
+
+SIMPLER = {
+    torch.ops.aten.lerp.Tensor: _lerp,
+    torch.ops.aten.unbind.int: _unbind,
     torch.ops.aten.silu_backward.default: _silu_backward,
+    torch.ops.aten.sigmoid_backward.default: _sigmoid_backward,
+    torch.ops.aten.tanh_backward.default: _tanh_backward,
     torch.ops.aten.select_backward.default: _select_backward,
     torch.ops.aten.slice_backward.default: _slice_backward,
 }
-"""Derivatives with fewer operators than those of torch, which fill tensors of zeros."""
+"""Derivatives and others with fewer operators than in torch, whose derivatives fill tensors of zeros."""

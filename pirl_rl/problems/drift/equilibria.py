@@ -11,6 +11,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import root
 from torch import Tensor
 
+from pirl_rl.problems.drift.constant import Constant
 from pirl_rl.problems.drift.vehicle import accelerations
 
 DEGREE = math.pi / 180
@@ -59,17 +60,13 @@ class EquilibriumCurves:
 
     def __init__(self):
         # Solved here, because the first call may be inside a transform of torch.func, where scipy cannot be used.
-        table = torch.from_numpy(_table())
-        self._tables: dict[tuple[torch.dtype, torch.device], Tensor] = {(table.dtype, table.device): table}
+        self._table = Constant(_table())
 
     def __call__(self, friction: Tensor) -> tuple[Tensor, ...]:
         low, high = FRICTION_BAND
         position = ((friction - low) * ((KNOTS - 1) / (high - low))).clamp(0, KNOTS - 1)
         knot = position.long().clamp(max=KNOTS - 2)
-        key = (friction.dtype, friction.device)
-        if key not in self._tables:
-            self._tables[key] = torch.from_numpy(_table()).to(friction)
-        table = self._tables[key]
+        table = self._table.like(friction)
         return torch.lerp(table[knot], table[knot + 1], (position - knot).unsqueeze(-1)).unbind(-1)
 
 

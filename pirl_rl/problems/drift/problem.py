@@ -16,8 +16,9 @@ from torch import Tensor
 from pirl_rl.payoffs import Payoff
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems.drift import vehicle
+from pirl_rl.problems.drift.constant import Constant
 from pirl_rl.problems.drift.equilibria import CURVATURE, DEGREE, FRICTION_BAND, SPEED, EquilibriumCurves
-from pirl_rl.sets import Box, Plane, band
+from pirl_rl.sets import Box, Plane
 
 FRICTION_RANGE = (0.25, 1.05)  # the friction coefficients outside of B
 
@@ -44,6 +45,11 @@ class VehicleDrift(ReachAvoidProblem):
     def __init__(self, payoff: Payoff | None = None, horizon: float | None = None):
         super().__init__(payoff, horizon)
         self.equilibrium_curves = EquilibriumCurves()
+        limits, (slow, fast), (low, high) = self.limits, self.speeds, FRICTION_RANGE
+        self._tolerances = Constant([*self.tolerances.values(), 0.0])
+        # The largest values outside of B of the sizes in `avoid_constraints`.
+        largest = [limits["e_y"], limits["e_psi"], -slow, fast, limits["v_y"], limits["r"], limits["delta"], 0.0]
+        self._largest = Constant([*largest, -low, high])
 
     def drift(self, x: Tensor, u: Tensor) -> Tensor:
         e_y, e_psi, v_x, v_y, r, delta, friction = x.unbind(-1)
@@ -67,38 +73,25 @@ class VehicleDrift(ReachAvoidProblem):
         columns.diagonal().copy_(torch.tensor(self.noise, dtype=x.dtype, device=x.device))
         return columns.expand(*x.shape, 6)
 
+    # Coordinates and constraints are the first axis of what is computed, so that each stays contiguous in memory, and
+    # what constraints share is computed for all of them at once.
+
     def target_constraints(self, x: Tensor) -> Tensor:
-        e_y, e_psi, v_x, v_y, r, delta, friction = x.unbind(-1)
+        e_y, e_psi, v_x, v_y, r, delta, friction = x.movedim(-1, 0).split(1)
         beta, yaw, steering = self.equilibrium_curves(friction)
-        tolerance = self.tolerances
+        sideslip = torch.atan(v_y / v_x.clamp(min=vehicle.LEAST_SPEED))
+        away = torch.cat([e_y, e_psi + beta, v_x - SPEED, sideslip - beta, r - yaw, delta - steering]).abs()
         low, high = self.friction_band
-        bands = [
-            band(e_y, 0.0, tolerance["e_y"]),
-            band(e_psi, -beta, tolerance["e_psi"]),
-            band(v_x, SPEED, tolerance["v_x"]),
-            band(torch.atan2(v_y, v_x.clamp(min=vehicle.LEAST_SPEED)), beta, tolerance["beta"]),
-            band(r, yaw, tolerance["r"]),
-            band(delta, steering, tolerance["delta"]),
-            torch.maximum(low - friction, friction - high),  # `band` would round at the edges
-        ]
-        return torch.stack(bands).movedim(0, -1)
+        # The distance from the middle of the band would round at its edges.
+        outside = torch.maximum(low - friction, friction - high)
+        return torch.cat([away, outside]).movedim(0, -1) - self._tolerances.like(x)
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
-        e_y, e_psi, v_x, v_y, r, delta, friction = x.unbind(-1)
-        limits, (slow, fast), (low, high) = self.limits, self.speeds, FRICTION_RANGE
-        bounds = [
-            limits["e_y"] - e_y.abs(),
-            limits["e_psi"] - e_psi.abs(),
-            v_x - slow,
-            fast - v_x,
-            limits["v_y"] - v_y.abs(),
-            limits["r"] - r.abs(),
-            limits["delta"] - delta.abs(),
-            v_x - v_y.abs(),  # a sideslip angle beta of 45 degrees
-            friction - low,
-            high - friction,
-        ]
-        return torch.stack(bounds).movedim(0, -1)
+        e_y, e_psi, v_x, v_y, r, delta, friction = x.movedim(-1, 0).split(1)
+        side = v_y.abs()
+        # The last but two stands for a sideslip angle beta of 45 degrees.
+        sizes = [e_y.abs(), e_psi.abs(), -v_x, v_x, side, r.abs(), delta.abs(), side - v_x, -friction, friction]
+        return self._largest.like(x) - torch.cat(sizes).movedim(0, -1)
 
     def unreachable(self, x: Tensor) -> Tensor:
         """States (*, n) with friction outside the band, (*) bool: friction is constant, and there is no target."""
