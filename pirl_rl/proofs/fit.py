@@ -63,14 +63,19 @@ class Fit:
         self.spline = equation.solve(self._source)
 
     def _checked(self, x: np.ndarray) -> np.ndarray:
-        """Those of states (N, n) that lie in cells which are not entirely in A or B."""
+        """Those of states (N, n) that are outside A and B, and those of A in cells that A's face crosses.
+
+        The latter are left out where W is given in the same cell, since it has a kink there.
+        """
         problem, states = self.equation.problem, torch.from_numpy(x)
         ended = problem.failed(states)
         if problem.objective == "reach-avoid":
             ended = ended | problem.reached(states)
-        going_on = np.zeros(self.mesh.cells[1:], bool)
-        going_on[self.mesh.cell_of(x[~ended.numpy()])] = True
-        return x[going_on[self.mesh.cell_of(x)]]
+        going_on, cells = x[~ended.numpy()], self.mesh.cell_of(x)
+        crossed, given = np.zeros(self.mesh.cells[1:], bool), np.zeros(self.mesh.cells[1:], bool)
+        crossed[self.mesh.cell_of(going_on)] = True
+        np.logical_or.at(given, cells, self.equation.given(x))
+        return x[~ended.numpy() | (crossed & ~given)[cells]]
 
     def at_points(self, rounds: int) -> None:
         """Raise the source until L^pi W is what the fit aims at in all cells, or `rounds` times.

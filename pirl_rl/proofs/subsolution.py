@@ -77,20 +77,20 @@ class Equation:
             avoid = face_points(lambda points: problem.avoid_constraints(points).amin(-1), mesh, x)
             avoid = avoid[((avoid > mesh.low) & (avoid < mesh.high)).all(-1)]  # the others are those of the sides
         ends, self._axis, self._outward = sides(problem, mesh, GAUSS)
-        self.points, self._ends = Points(problem, policy, mesh, self.outside(x)), Points(problem, policy, mesh, ends)
+        self.points, self._ends = Points(problem, policy, mesh, x[~self.given(x)]), Points(problem, policy, mesh, ends)
         self._target, self._avoid = design(mesh.space, target), design(mesh.space, avoid)
         self._smoothing = SMOOTHING * _third_differences(mesh.shape)
         self._operators = [self.points.operator(tau) for tau in mesh.taus]
         self._steps = [self._step(k) for k in range(1, len(mesh.taus))]
         self._start = self._start_from(x)
 
-    def outside(self, x: np.ndarray) -> np.ndarray:
-        """Those of states (N, n) that are outside B, and outside the smooth part of A."""
+    def given(self, x: np.ndarray) -> np.ndarray:
+        """Whether states (N, n) are in B, or in the smooth part of A."""
         states = torch.from_numpy(x)
         ended = self.problem.failed(states)
         if self.problem.objective == "reach-avoid":
             ended = ended | (self._level(states) <= 0)
-        return x[~ended.numpy()]
+        return ended.numpy()
 
     def solve(self, source: np.ndarray) -> Spline:
         """W for a source m (levels of tau, N) >= 0 at the points, in 1/s."""
