@@ -25,6 +25,9 @@ SHORT = {
     "collector.frames_per_batch=10240 collector.warmup_frames=10240 evaluation.calibration.rollouts=64 "
     "evaluation.success.episodes=1000'",
 }
+TRAINING_LONG = ("01_quickstart", "03_schedules")
+"""Notebooks that take more than a minute; the examples of the README and of the docs, which are like them, do not."""
+
 LIMITS = {
     "01_quickstart": {"max": 0.15},
     "02_drift": {"max": 0.5, "mean": 0.06},
@@ -43,7 +46,10 @@ def printed(cell: nbformat.NotebookNode) -> str:
     return "".join(output.text for output in cell.outputs if output.get("name") == "stdout")
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in TRAINING_LONG)) for path in NOTEBOOKS],
+)
 def test_notebook_executes(path, tmp_path, monkeypatch):
     """The last line printed says how far the value of the last cell's run is from Monte Carlo of its own policy.
 

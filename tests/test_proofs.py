@@ -408,6 +408,7 @@ def test_the_command_writes_a_proof(trained, in_process):
     assert f"at least {found['best']:.4f}" in text
     run = load_run(trained)
     assert found["networks"] == Deployed(run.solution, run.simulator).digest()
+    assert (trained / "figures" / "proof.png").stat().st_size > 10_000
     proof = run.load_proof(trained / "proof.npz")
     assert proof.bound(np.array([run.problem.horizon]), np.array([found["best_state"]]))[0] == found["best"]
     with torch.no_grad():

@@ -8,8 +8,8 @@ in the run directory. A certificate counts if it is made once: `picked_from` is 
 which the best one is shown. The report of the run is drawn again.
 
 With method=interval it proves a lower bound of the probability of success for all states at once, with certainty, and
-writes it to proof.json and proof.npz. The bound is about continuous feedback, and the statistical claims are about the
-simulator, which holds each control for a step. Problems have at most three states.
+writes it to proof.json and proof.npz, with figures. The bound is about continuous feedback, and the statistical claims
+are about the simulator, which holds each control for a step. Problems have at most three states.
 
     run          the directory of a finished run
     claims       success: a lower bound of the probability of success;
@@ -57,6 +57,8 @@ from omegaconf.errors import OmegaConfBaseException
 from pirl_rl.commands.console import quiet_libraries, reported
 from pirl_rl.commands.report import draw_again
 from pirl_rl.errors import ConfigError
+from pirl_rl.figures.files import save_figures
+from pirl_rl.figures.proof import draw_proof
 from pirl_rl.files import replacing
 from pirl_rl.progress import announce, helped
 from pirl_rl.proofs.proof import LEVELS
@@ -112,7 +114,8 @@ def _prove(run: Run, directory: RunDirectory, settings: dict[str, Any]) -> list[
     found = proof.to_dict(run.problem)
     with replacing(directory.proof) as file:
         file.write(json.dumps(found, indent=2) + "\n")
-    directory.bound.unlink(missing_ok=True)  # that of an earlier proof
+    for path in (directory.bound, *directory.figures.glob("proof*.png")):
+        path.unlink(missing_ok=True)  # of an earlier proof
     lowered = [f"          W is lowered by {proof.margin:.3f}, so that it holds also on these boxes:"]
     lowered += [f"resists   {name}, {len(boxes):,} boxes" for name, boxes in proof.resisted.items()]
     resists = lowered if proof.resisted else []
@@ -123,6 +126,7 @@ def _prove(run: Run, directory: RunDirectory, settings: dict[str, Any]) -> list[
             f"written   {directory.proof}",
         ]
     proof.save(directory.bound)
+    figures = save_figures(draw_proof(run.solution, proof), directory.figures)
     horizon = run.problem.horizon
     return [
         f"proved    Under continuous feedback the policy succeeds from {found['best_state']} with {horizon:g} s to go",
@@ -135,8 +139,7 @@ def _prove(run: Run, directory: RunDirectory, settings: dict[str, Any]) -> list[
         "          The bound is not about a simulator, which holds each control for a step.",
         *resists,
         f"boxes     {proof.boxes:,}, in {proof.seconds:.0f} s",
-        f"written   {directory.proof}",
-        f"written   {directory.bound}",
+        *(f"written   {path}" for path in (directory.proof, directory.bound, *figures)),
     ]
 
 
