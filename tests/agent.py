@@ -9,6 +9,9 @@ from __future__ import annotations
 import json
 import sys
 
+LEAST = 0.1
+"""The weight after one that is 0, which no factor raises."""
+
 
 def advise(prompt: str) -> dict:
     """A plan of one candidate from the record that the prompt shows."""
@@ -22,7 +25,7 @@ def advise(prompt: str) -> dict:
         "name": f"a{len(results) + 1}",
         "start_checkpoint": begin["checkpoint"],
         "schedule_initial": [td, hjb, boundary],
-        "schedule_final": [td, factor * last["weights"][1], boundary],
+        "schedule_final": [td, factor * last["weights"][1] or LEAST, boundary],
         "schedule_center": 500,
         "schedule_sharpness": 0.02,
     }
