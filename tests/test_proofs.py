@@ -298,6 +298,24 @@ def test_an_invariance_problem_is_proved():
     assert 0.3 < proof.bound(np.array([2.0]), np.zeros((1, 1)))[0] < 0.37
 
 
+class SlowSafety(Safety1D):
+    """The same problem with 1,800 times longer seconds."""
+
+    horizon = 1800 * Safety1D.horizon
+
+    def drift(self, x, u):
+        return super().drift(x, u) / 1800
+
+    def diffusion(self, x, u):
+        return super().diffusion(x, u) / 1800**0.5
+
+
+def test_a_bound_does_not_depend_on_the_unit_of_time():
+    x = np.array([[-0.5], [0.0], [0.5]])
+    fast, slow = (prove_success(Stand(problem, Feedback(-4.0)), "none") for problem in (Safety1D(), SlowSafety()))
+    assert slow.bound(np.full(3, 3600.0), x) == pytest.approx(fast.bound(np.full(3, 2.0), x), abs=1e-6)
+
+
 def test_nothing_is_proved_for_a_policy_that_fails():
     """Under u = -1 the probability to reach 2 from 0 is exp(-4) = 0.018 times that under u = 1, by Girsanov."""
     proof = prove_success(Stand(Reach1D(), constant(-1.0)), "none")

@@ -14,8 +14,8 @@ from pirl_rl.proofs.points import Points, Policy
 from pirl_rl.proofs.spline import DEGREE, knots_of
 from pirl_rl.proofs.subsolution import Equation
 
-LEAST = 0.003
-"""The least value of L^pi W at which a fit aims, in 1/s."""
+LOSS = 0.006
+"""What W loses over the horizon to the least value of L^pi W at which a fit aims, LOSS / T in 1/s."""
 
 SLACK = 0.3
 """The share of the variation of L^pi W within a cell that its least value there is to exceed."""
@@ -59,7 +59,8 @@ class Fit:
         taus = self.mesh.taus
         times = np.unique((taus[:-1, None] + np.diff(taus)[:, None] * np.array(TIMES)).ravel())
         self._rates = [(tau, *self._points.rates(tau)) for tau in times]
-        self._source = np.full((len(taus), len(equation.points.x)), LEAST)
+        self._least = LOSS / equation.problem.horizon
+        self._source = np.full((len(taus), len(equation.points.x)), self._least)
         self.spline = equation.solve(self._source)
 
     def _checked(self, x: np.ndarray) -> np.ndarray:
@@ -95,7 +96,7 @@ class Fit:
             Whether the source could be raised.
         """
         missing = np.zeros(self.mesh.cells)
-        np.maximum.at(missing, tuple(boxes.cell.T.numpy()), (LEAST - low).clamp(min=0).numpy())
+        np.maximum.at(missing, tuple(boxes.cell.T.numpy()), (self._least - low).clamp(min=0).numpy())
         return self.raise_in(missing)
 
     def raise_in(self, missing: np.ndarray) -> bool:
@@ -131,7 +132,7 @@ class Fit:
                 np.minimum.at(least[k], self._cells, low)
                 np.maximum.at(most[k], self._cells, high)
         asked = np.isfinite(least)
-        wanted = LEAST + SLACK * np.where(asked, most - least, 0.0)
+        wanted = self._least + SLACK * np.where(asked, most - least, 0.0)
         return np.where(asked & (least < ENOUGH * wanted), wanted - least, 0.0)
 
     def _residuals(self):
