@@ -15,7 +15,6 @@ __all__ = [
     "ScheduledTD3Loss",
     "carried",
     "lock_writes_with",
-    "plays_at_random",
     "write_lock",
 ]
 
@@ -29,11 +28,6 @@ class ScheduledTD3Loss(TD3Loss):
 def carried(collector: Collector) -> TensorDictBase:
     """The TensorDict that a collector keeps between steps, with the states of all environments."""
     return collector._carrier
-
-
-def plays_at_random(collector: Collector) -> bool:
-    """Whether the next batch of a collector belongs to its warm-up with random actions."""
-    return collector._should_use_random_frames()
 
 
 def write_lock(buffer: TensorDictReplayBuffer) -> Any:

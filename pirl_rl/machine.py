@@ -37,16 +37,27 @@ def record_session(run: RunDirectory, arguments: Sequence[str], device: torch.de
         {
             "command": shlex.join(["python", "-m", "pirl_rl.train", *arguments]),
             "started": datetime.now(UTC).isoformat(timespec="seconds"),
-            "device": _name_of(torch.device(device)),
-            "processor": _processor(),
-            "cores": os.cpu_count(),
-            "system": f"{platform.system()} {platform.release()}, {platform.machine()}",
-            "python": platform.python_version(),
-            **{name: version_of(name) for name in PACKAGES},
+            **describe(device),
         }
     )
     with replacing(run.machine) as file:
         file.write(json.dumps({"sessions": sessions}, indent=2) + "\n")
+
+
+def describe(device: torch.device | str = "cpu") -> dict[str, Any]:
+    """The machine without its name, and the versions, as plain values.
+
+    Args:
+        device: where the networks are.
+    """
+    return {
+        "device": _name_of(torch.device(device)),
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "system": f"{platform.system()} {platform.release()}, {platform.machine()}",
+        "python": platform.python_version(),
+        **{name: version_of(name) for name in PACKAGES},
+    }
 
 
 def read_sessions(run: RunDirectory) -> list[dict[str, Any]]:

@@ -67,6 +67,19 @@ def test_random_actions_are_their_own_center():
     assert torch.equal(one["loc"], one["action"])
 
 
+def test_a_batch_may_change_from_random_actions_to_the_policy():
+    batch, random = two_paths(), 2
+    batch["played"], batch["next", "noise"] = batch["action"].clone(), torch.ones(2, 5, 2)
+    batch["played"][:, :random] += 0.5
+    batch["slope"] = torch.ones(2, 5, 2)
+    one = Transitions(1)(batch).reshape(2, 5)
+    assert torch.equal(one["loc"][:, :random], batch["action"][:, :random])
+    assert torch.equal(one["loc"][:, random:], batch["loc"][:, random:])
+    without = batch["next", "reward"] - one["next", "reward"]
+    assert torch.equal(without[:, :random], torch.zeros(2, random, 1))
+    assert torch.equal(without[:, random:], torch.full((2, 5 - random, 1), 2.0))
+
+
 @pytest.mark.parametrize(("n_steps", "column"), [(20, 0), (20, 12), (5, 3)])
 def test_returns_under_the_optimal_control_agree_with_the_exact_value(n_steps, column):
     """E[return + (1 - terminated) V(next)] = V(now): bridge and drift are exact. One transition per environment, hence

@@ -132,7 +132,7 @@ def test_a_stage_of_policy_gradients_follows_its_own_noise_alone(collector, tmp_
     trainer.train()
     rules = [(BestControl, 0.0, True)] * 3 + [(ClippedSurrogate, 0.3, True)] * 6 + [(BestControl, 0.1, True)] * 3
     assert [one[:3] for one in seen] == rules
-    assert all(off == 0.0 for *_, off in seen[:3])
+    assert [off for *_, off in seen[:3]] == [0.0] * 3
     assert all(0.5 < off < 2.0 for *_, off in seen[3:9])
     assert all(0.1 < off < 0.6 for *_, off in seen[9:])
 

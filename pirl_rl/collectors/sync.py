@@ -11,7 +11,7 @@ from pirl_rl.checkpoint import restore_rng
 from pirl_rl.collectors.buffers import buffer_state, check_sizes, fill_buffer, load_buffer, make_buffer
 from pirl_rl.collectors.transitions import ControlVariate, Exploration, PlayedPolicy, Transitions
 from pirl_rl.envs import ReachAvoidEnv
-from pirl_rl.internals import carried, plays_at_random
+from pirl_rl.internals import carried
 from pirl_rl.networks import Actor
 from pirl_rl.sampling.initial_states import InitialStates
 
@@ -130,7 +130,4 @@ class SyncCollector:
         self._collector.load_state_dict({**self._collector.state_dict(), "frames": frames})  # type: ignore[arg-type]
 
     def _collect(self) -> None:
-        # In the warm-up, TorchRL leaves earlier outputs of the policy, "loc" and "slope", beside the random actions.
-        random = plays_at_random(self._collector)
-        batch = next(self._batches)
-        self.buffer.extend(self._transitions(batch.exclude("loc", "slope") if random else batch))
+        self.buffer.extend(self._transitions(next(self._batches)))

@@ -106,14 +106,15 @@ class ControlVariate(nn.Module):
 class PlayedPolicy(TensorDictModuleBase):
     """The actor followed by the noise and, if there is one, the control variate, as a policy for collectors.
 
-    It writes "loc", the actor's output (N, m), the played "action" (N, m) and, with a control variate, "slope" (N, n).
+    It writes "loc", the actor's output (N, m), the "action" (N, m) and, with a control variate, "slope" (N, n).
+    "played" repeats the action, so that steps of this policy can be told from random ones.
     """
 
     def __init__(self, actor: nn.Module, exploration: Exploration, control_variate: ControlVariate | None = None):
         super().__init__()
         self.actor, self.exploration, self.control_variate = actor, exploration, control_variate
         self.in_keys = ["tau", "state", "is_init"]
-        self.out_keys = ["loc", "action"] if control_variate is None else ["loc", "action", "slope"]
+        self.out_keys = ["loc", "action", "played", *([] if control_variate is None else ["slope"])]
         self._compiled: Compiled | None = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -127,7 +128,8 @@ class PlayedPolicy(TensorDictModuleBase):
             constant = self.control_variate.simulator.constant_sigma
             loc, slope = (self._compiled or self._with_slope)(tau, state, constant)
             tensordict.set("slope", slope)
-        return tensordict.set("loc", loc).set("action", self.exploration(loc, tensordict["is_init"]))
+        action = self.exploration(loc, tensordict["is_init"])
+        return tensordict.set("loc", loc).set("action", action).set("played", action.clone())
 
     def _with_slope(self, tau: Tensor, state: Tensor, constant: Tensor | None) -> tuple[Tensor, Tensor]:
         loc = self.actor(tau, state)
@@ -154,9 +156,7 @@ class Transitions:
         self.n_steps = n_steps
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
-        if "loc" not in batch.keys():
-            # The random actions of a warm-up come from no actor.
-            batch = batch.set("loc", batch["action"])
+        batch = _without_random(batch)
         gain = (batch["slope"] * batch["next", "noise"]).sum(-1, keepdim=True) if "slope" in batch.keys() else None
         batch = batch.select(*TRANSITION)
         following: TensorDictBase = batch.get("next")
@@ -173,3 +173,20 @@ class Transitions:
             total = total - (until.gather(1, end) - until + gain)
         batch["next"] = following.gather(1, end.squeeze(-1)).set("reward", total)
         return batch.reshape(-1)
+
+
+def _without_random(batch: TensorDictBase) -> TensorDictBase:
+    """The batch, where random actions of a warm-up are their own "loc" and have no slope: they come from no actor.
+
+    TorchRL leaves earlier outputs of the policy beside random actions, and worker processes may change from random
+    actions to the policy within a batch.
+    """
+    batch = batch.copy()
+    if "loc" not in batch.keys():
+        return batch.set("loc", batch["action"])
+    if "played" in batch.keys():
+        own = (batch["played"] == batch["action"]).all(-1, keepdim=True)
+        batch = batch.set("loc", torch.where(own, batch["loc"], batch["action"]))
+        if "slope" in batch.keys():
+            batch = batch.set("slope", torch.where(own, batch["slope"], 0.0))
+    return batch

@@ -1,0 +1,236 @@
+"""TD3 against Stable-Baselines3 and against TorchRL's own loop: updates a second, and played steps a second.
+
+    python benchmarks/peers.py [--rounds 20] [--updates 50] [--json FILE]
+
+An update draws a batch from the replay buffer, takes a step of Adam for two critics and, every second time, one for the
+actor and one of the target networks. Widths, batch size, and rates are equal. TorchRL's loop is that of its TD3 script:
+`TD3Loss`, `SoftUpdate` and Adam, run eagerly. A played step is one control step of one path, with its policy, noise and
+storage in the replay buffer. Stable-Baselines3 plays the Gymnasium view of the same problem: one environment, which is
+its default, or 64 paths of the vector environment. The variants take turns, and rates are medians over the rounds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import statistics
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from stable_baselines3 import TD3
+from stable_baselines3.common.noise import NormalActionNoise
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.objectives import SoftUpdate, TD3Loss
+
+from pirl_rl.assembly import make_trainer
+from pirl_rl.commands.composition import compose
+from pirl_rl.envs import ReachAvoidEnv
+from pirl_rl.gymnasium import ReachAvoidVectorGym
+from pirl_rl.machine import describe
+from pirl_rl.rivals.stable_baselines import Paths
+from pirl_rl.trainer import Trainer
+
+ACTOR, CRITIC, BATCH = (32, 32), (64, 64, 64), 256
+"""The widths of the hidden layers, and the transitions of an update."""
+
+EXPERIMENTS = {"the 1-D problem": "reach1d", "the drifting vehicle": "drift"}
+
+SETTINGS = (
+    "method=td3",
+    "device=cpu",
+    "logger=none",
+    f"actor={{hidden:{[*ACTOR]},activation:ReLU}}",
+    f"critic={{hidden:{[*CRITIC]},activation:Tanh,output:null,root_time:false}}",
+    f"trainer.batch_size={BATCH}",
+    "learner={learning_rate:1e-3,decay:constant}",
+)
+
+
+def ours(experiment: str) -> Trainer:
+    """Our trainer of TD3, with a full replay buffer."""
+    trainer = make_trainer(compose("train", [f"+experiment={experiment}", *SETTINGS]))
+    trainer._enter_stage()
+    trainer.collector.start()
+    return trainer
+
+
+def update_ours(trainer: Trainer) -> Callable[[int], None]:
+    def updates(count: int) -> None:
+        for k in range(count):
+            batch = trainer.batches.sample((1.0, 0.0, 0.0), 0.0)
+            trainer.learner.update(batch, k, (1.0, 0.0, 0.0), 0.0)
+
+    return updates
+
+
+class Perceptron(nn.Sequential):
+    """A multilayer perceptron of the joined inputs."""
+
+    def __init__(self, widths: tuple[int, ...], activation: type[nn.Module], *last: nn.Module):
+        layers: list[nn.Module] = []
+        for width, following in itertools.pairwise(widths[:-1]):
+            layers += [nn.Linear(width, following), activation()]
+        super().__init__(*layers, nn.Linear(*widths[-2:]), *last)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        return super().forward(torch.cat(inputs, -1))
+
+
+def update_torchrl(trainer: Trainer) -> Callable[[int], None]:
+    """TorchRL's own loop on the transitions of our buffer."""
+    problem = trainer.learner.loss.problem
+    n, m = problem.states.dim, problem.controls.dim
+    actor = TensorDictModule(Perceptron((1 + n, *ACTOR, m), nn.ReLU, nn.Tanh()), ["tau", "state"], ["action"])
+    critic = TensorDictModule(
+        Perceptron((1 + n + m, *CRITIC, 1), nn.Tanh), ["tau", "state", "action"], ["state_action_value"]
+    )
+    bounds = (-torch.ones(m), torch.ones(m))
+    loss = TD3Loss(actor, critic, bounds=bounds, num_qvalue_nets=2, loss_function="l2")  # type: ignore[arg-type]
+    loss.make_value_estimator(gamma=1.0)
+    targets = SoftUpdate(loss, tau=0.005)
+    critic_adam = torch.optim.Adam(loss.qvalue_network_params.parameters(), 1e-3)
+    actor_adam = torch.optim.Adam(loss.actor_network_params.parameters(), 1e-3)
+    transitions = trainer.collector.buffer[:]
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(len(transitions)), batch_size=BATCH)
+    buffer.extend(transitions)
+
+    def updates(count: int) -> None:
+        for k in range(count):
+            batch = buffer.sample()
+            loss_critic, _ = loss.value_loss(batch)
+            loss_critic.backward()
+            critic_adam.step()
+            critic_adam.zero_grad()
+            if k % 2 == 0:
+                loss_actor, _ = loss.actor_loss(batch)
+                loss_actor.backward()
+                actor_adam.step()
+                actor_adam.zero_grad()
+                targets.step()
+
+    return updates
+
+
+def sb3(trainer: Trainer, paths: int) -> TD3:
+    """TD3 of Stable-Baselines3 on the same problem and simulator."""
+    own = trainer.collector.env
+    steps = {name: getattr(own.simulator, name) for name in ("dt", "substeps", "crossing")}
+    env = ReachAvoidEnv(own.problem, **steps, num_envs=paths, initial_states=own.initial_states, seed=0)
+    view = Paths(ReachAvoidVectorGym(env))
+    m = own.problem.controls.dim
+    return TD3(
+        "MlpPolicy",
+        view,
+        batch_size=BATCH,
+        policy_kwargs={"net_arch": {"pi": [*ACTOR], "qf": [*CRITIC]}, "activation_fn": nn.Tanh},
+        action_noise=NormalActionNoise(torch.zeros(m).numpy(), 0.2 * torch.ones(m).numpy()),
+        learning_starts=0,
+        train_freq=10**9,
+        seed=0,
+        device="cpu",
+    )
+
+
+def update_sb3(trainer: Trainer) -> Callable[[int], None]:
+    model = sb3(trainer, 64)
+    model.train_freq = model.train_freq._replace(frequency=5)
+    model.gradient_steps = 0
+    model.learn(6_400)
+    return lambda count: model.train(count, BATCH)
+
+
+def play_ours(trainer: Trainer) -> Callable[[], int]:
+    def play() -> int:
+        trainer.collector._collect()
+        return trainer.collector._collector.frames_per_batch
+
+    return play
+
+
+def step_ours(trainer: Trainer) -> Callable[[], int]:
+    env = trainer.collector.env
+    start = env.reset()
+    start["action"] = torch.zeros(env.action_spec.shape)
+
+    def play() -> int:
+        for _ in range(10):
+            env.step(start)
+        return 10 * env.batch_size[0]
+
+    return play
+
+
+def play_sb3(trainer: Trainer, paths: int) -> Callable[[], int]:
+    model = sb3(trainer, paths)
+    model.train_freq, model.gradient_steps = model.train_freq._replace(frequency=100), 0
+
+    def play() -> int:
+        before = model.num_timesteps
+        model.learn(100 * paths, reset_num_timesteps=False)
+        return model.num_timesteps - before
+
+    return play
+
+
+def turns(works: dict[str, Callable[[], float]], rounds: int) -> dict[str, float]:
+    """The median rate of each work, where the works take turns and each returns what it did."""
+    rates: dict[str, list[float]] = {name: [] for name in works}
+    for work in works.values():
+        work()
+    for _ in range(rounds):
+        for name, work in works.items():
+            started = time.perf_counter()
+            done = work()
+            rates[name].append(done / (time.perf_counter() - started))
+    return {name: statistics.median(entries) for name, entries in rates.items()}
+
+
+def measure(experiment: str, rounds: int, updates: int) -> dict[str, dict[str, float]]:
+    trainer = ours(experiment)
+
+    def counted(work: Callable[[int], None]) -> Callable[[], float]:
+        return lambda: work(updates) or updates
+
+    updating = {
+        "pirl_rl": counted(update_ours(trainer)),
+        "TorchRL, eager": counted(update_torchrl(trainer)),
+        "Stable-Baselines3": counted(update_sb3(trainer)),
+    }
+    playing: dict[str, Callable[[], float]] = {
+        "pirl_rl, environment": step_ours(trainer),
+        "pirl_rl, collector": play_ours(trainer),
+        "Stable-Baselines3, one environment": play_sb3(trainer, 1),
+        "Stable-Baselines3, 64 paths": play_sb3(trainer, 64),
+    }
+    return {"updates a second": turns(updating, rounds), "played steps a second": turns(playing, max(3, rounds // 4))}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=20)
+    parser.add_argument("--updates", type=int, default=50)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    warnings.filterwarnings("ignore", message="No target network updater")
+    found: dict[str, Any] = {}
+    for name, experiment in EXPERIMENTS.items():
+        found[name] = measure(experiment, arguments.rounds, arguments.updates)
+        for what, rates in found[name].items():
+            first = next(iter(rates.values()))
+            print(f"\n{name}, {what}, one thread\n\n| | rate | ours, times faster |\n|---|--:|--:|")
+            for label, rate in rates.items():
+                print(f"| {label} | {rate:,.0f} | {first / rate:.1f} |")
+    if arguments.json:
+        arguments.json.write_text(json.dumps({"machine": describe(), "found": found}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
