@@ -44,12 +44,15 @@ EXPERIMENTS = {"the 1-D problem": "reach1d", "the drifting vehicle": "drift"}
 
 SETTINGS = (
     "method=td3",
+    "recipe=any_problem",
     "device=cpu",
     "logger=none",
-    f"actor={{hidden:{[*ACTOR]},activation:ReLU}}",
-    f"critic={{hidden:{[*CRITIC]},activation:Tanh,output:null,root_time:false}}",
+    f"actor={{hidden:{[*ACTOR]},activation:ReLU,root_time:false,spread:null,levels:false}}",
+    f"critic={{hidden:{[*CRITIC]},activation:Tanh,output:null,root_time:false,spread:null,levels:false}}",
+    "learner={learning_rate:1e-3,decay:constant,optimizer:adam,polyak:0.005}",
+    "collector.control_variate=null",
+    "trainer.updates=1000",
     f"trainer.batch_size={BATCH}",
-    "learner={learning_rate:1e-3,decay:constant}",
 )
 
 
@@ -148,8 +151,9 @@ def update_sb3(trainer: Trainer) -> Callable[[int], None]:
 
 def play_ours(trainer: Trainer) -> Callable[[], int]:
     def play() -> int:
+        before = trainer.collector.buffer.write_count
         trainer.collector._collect()
-        return trainer.collector._collector.frames_per_batch
+        return trainer.collector.buffer.write_count - before
 
     return play
 
@@ -186,9 +190,9 @@ def turns(works: dict[str, Callable[[], float]], rounds: int) -> dict[str, float
         work()
     for _ in range(rounds):
         for name, work in works.items():
-            started = time.perf_counter()
+            started = time.process_time()
             done = work()
-            rates[name].append(done / (time.perf_counter() - started))
+            rates[name].append(done / (time.process_time() - started))
     return {name: statistics.median(entries) for name, entries in rates.items()}
 
 

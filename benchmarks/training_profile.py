@@ -1,6 +1,6 @@
 """Where the time of a training goes: the share of each part of real updates, without and with the physics.
 
-    python benchmarks/training_profile.py [--experiments reach1d quadrotor drift] [--updates 300] [--json FILE] [key=value ...]
+    python benchmarks/training_profile.py [--experiments reach1d quadrotor] [--updates 300] [--json FILE] [key=value]
 
 Each experiment is trained with the default recipe and `key=value` settings for `--updates` updates after a first
 hundred, in which everything is compiled. Times are those of one call without the calls inside it, so that the rows add

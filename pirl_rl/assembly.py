@@ -39,6 +39,9 @@ PATHS = {
 }
 """Numbers of paths of evaluators, by evaluator and argument: the largest and the smallest that are chosen."""
 
+PROGRESS_SHARE = 5
+"""The evaluator `progress` plays one in this number of the episodes of `success`."""
+
 CHEAP_PATH = 10_000
 """The number of coordinates of all integration steps of a path up to which evaluators have the largest numbers."""
 
@@ -182,6 +185,9 @@ def choose_paths(config: DictConfig, problem: ReachAvoidProblem) -> None:
     for (evaluator, argument), (most, least) in PATHS.items():
         if config.evaluation.get(evaluator, {}).get(argument) == AUTO:
             config.evaluation[evaluator][argument] = max(least, min(most, round(most * CHEAP_PATH / moves)))
+    if config.evaluation.get("progress", {}).get("episodes") == AUTO:
+        episodes = convert(config.evaluation.success.episodes, int, "evaluation.success.episodes")
+        config.evaluation.progress.episodes = max(1, episodes // PROGRESS_SHARE)
 
 
 def _without_problem(config: DictConfig) -> DictConfig:

@@ -250,10 +250,11 @@ def test_evaluation_plays_fewer_paths_where_they_cost_more(experiment, episodes,
     choose_time_steps(config, problem)
     choose_paths(config, problem)
     assert (config.evaluation.success.episodes, config.evaluation.calibration.rollouts) == (episodes, rollouts)
+    assert config.evaluation.progress.episodes == episodes // 5
 
 
 def test_numbers_of_paths_that_are_given_stay():
     config = compose("train", ["+experiment=reach1d", "evaluation.success.episodes=77"])
     choose_time_steps(config, Safety1D())
     choose_paths(config, Safety1D())
-    assert config.evaluation.success.episodes == 77
+    assert (config.evaluation.success.episodes, config.evaluation.progress.episodes) == (77, 15)
