@@ -19,10 +19,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from pirl_rl import compilation
 from pirl_rl.actor_rules import Q
+from pirl_rl.learner import with_gradient
 from pirl_rl.losses import PIRLLoss
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.problem import ReachAvoidProblem
@@ -125,32 +127,33 @@ class Variant:
         ]
         self.critic_adam = torch.optim.Adam(self.critics, 1e-4, fused=True)
         self.actor_adam = torch.optim.Adam(self.actor, 1e-4, fused=True)
-        wrap: Callable = torch.compile if compiled else lambda function: function
+        wrap: Callable = compilation.compiled if compiled else lambda function: function
         if compiled and kind is NestedLoss:
             self.loss._residuals = torch.compiler.disable(self.loss._residuals)  # type: ignore[method-assign]
-        self.critic_loss, self.actor_loss = wrap(self.loss.critic_loss), wrap(self.loss.actor_loss)
-        self.hjb_loss = wrap(self.loss._hjb_loss)
+        self.critic_loss = wrap(with_gradient(self.loss.critic_loss, self.loss.qvalue_network_params))
+        self.actor_loss = wrap(with_gradient(self.loss.actor_loss, self.loss.actor_network_params))
+        self.hjb_loss = wrap(with_gradient(self._hjb_loss, self.loss.qvalue_network_params))
         self.count = 0
 
     def update(self) -> None:
         self.count += 1
-        loss, _ = self.critic_loss(self.batch)
-        self._descend(loss, self.critic_adam)
+        self._descend(self.critics, self.critic_loss(self.batch)[-1], self.critic_adam)
         if self.count % 2 == 0:
-            loss, _ = self.actor_loss(self.batch)
-            self._descend(loss, self.actor_adam)
+            self._descend(self.actor, self.actor_loss(self.batch)[-1], self.actor_adam)
             with torch.no_grad():
                 for targets, sources in self.pairs:
                     torch._foreach_lerp_(targets, sources, POLYAK)
 
     def hjb(self) -> None:
-        self.hjb_loss(self.batch["collocation"]).backward()
-        self.critic_adam.zero_grad()
+        self.hjb_loss(self.batch["collocation"])
+
+    def _hjb_loss(self, points: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        return self.loss._hjb_loss(points), {}
 
     @staticmethod
-    def _descend(loss: Tensor, optimiser: torch.optim.Optimizer) -> None:
-        optimiser.zero_grad()
-        loss.backward()
+    def _descend(params: list[Tensor], gradient: tuple[Tensor, ...], optimiser: torch.optim.Optimizer) -> None:
+        for parameter, entry in zip(params, gradient, strict=True):
+            parameter.grad = entry
         optimiser.step()
 
 

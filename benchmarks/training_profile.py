@@ -75,19 +75,12 @@ def watch(trainer: Trainer, clock: Clock) -> None:
     clock.watch(collector.buffer, "extend", "collector: buffer")
     clock.watch(trainer.batches, "sample", "sampling of the batch")
     clock.watch(learner, "update", "update: the rest")
-    clock.watch(learner, "_critic_loss", "update: critic loss, forward")
-    clock.watch(learner, "_actor_loss", "update: actor loss, forward")
+    clock.watch(learner, "_critic_loss", "update: critic loss and gradient")
+    clock.watch(learner, "_actor_loss", "update: actor loss and gradient")
     clock.watch(learner.targets, "step", "update: target networks")
     for name in ("critic", "actor"):
         for optimizer in getattr(learner, f"{name}_optimizers"):
             clock.watch(optimizer, "step", f"update: optimiser of the {name}, {type(optimizer).__name__}")
-    step = learner._step
-
-    def counted(parts: list, loss: torch.Tensor) -> None:
-        with clock.part(f"update: {'critic' if parts is learner.critic_optimizers else 'actor'} loss, backward"):
-            step(parts, loss)
-
-    learner._step = counted  # type: ignore[method-assign]
 
 
 def loop(trainer: Trainer, updates: int) -> None:

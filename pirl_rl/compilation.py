@@ -28,6 +28,7 @@ def compiled(function: Callable[..., Any], whole: bool = False) -> Callable[...,
             ones, which together may be slower than none.
     """
     _give_zeros_memory()
+    _trace_gradients()
     # PyTorch's own overloads lack the last argument.
     return torch.compile(function, fullgraph=whole, dynamic=False, isolate_recompiles=True)  # pyright: ignore
 
@@ -85,6 +86,14 @@ def _give_zeros_memory() -> None:
     from torch._inductor.decomposition import decompositions
 
     decompositions.setdefault(torch.ops.aten._efficientzerotensor.default, _filled)
+
+
+def _trace_gradients() -> None:
+    """Let compiled programs contain `torch.autograd.grad`, so that a loss and its gradient are one program."""
+    # The import takes a second, which commands that compile nothing need not spend.
+    import torch._dynamo.config
+
+    torch._dynamo.config.trace_autograd_ops = True
 
 
 def _filled(size: Any, **options: Any) -> torch.Tensor:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, TensorDictParams
 from torch import Tensor
 from torchrl.objectives import SoftUpdate
 
@@ -22,7 +22,13 @@ from pirl_rl.schedules import WEIGHTS, Weights
 EXPLOSION = 1e6
 """A loss above this is a divergence. Errors of probabilities are at most 1, and useful residuals are far smaller."""
 
-LossFunction = Callable[[TensorDictBase], tuple[Tensor, dict[str, Tensor]]]
+Terms = dict[str, Tensor]
+
+LossFunction = Callable[[TensorDictBase], tuple[Tensor, Terms]]
+"""Maps a batch to a loss, and to terms of it by name."""
+
+Differentiated = Callable[[TensorDictBase], tuple[Tensor, Terms, tuple[Tensor | None, ...]]]
+"""Maps a batch to a loss, its terms and its gradient in the parameters."""
 
 
 class Learner:
@@ -108,15 +114,17 @@ class Learner:
             setattr(self.loss, name, value)
         for optimizer in (*self.critic_optimizers, *self.actor_optimizers):
             optimizer.param_groups[0]["lr"] = self.rate(decay)
-        loss, terms = self._evaluated("critic", batch)
+        loss, terms = self._differentiated("critic", batch)
         self._check(loss, terms, k + 1)
-        self._step(self.critic_optimizers, loss)
+        for optimizer in self.critic_optimizers:
+            optimizer.step()
         if k % self.actor_every == 0:
             if self.train_actor:
-                loss_actor, _ = self._evaluated("actor", batch)
+                loss_actor, _ = self._differentiated("actor", batch)
                 self._check(loss_actor, {"loss_actor": loss_actor}, k + 1)
-                self._step(self.actor_optimizers, loss_actor)
-                self._loss_actor = loss_actor.detach()
+                for optimizer in self.actor_optimizers:
+                    optimizer.step()
+                self._loss_actor = loss_actor
             self.targets.step()
         return {**terms, "loss_actor": self._loss_actor}
 
@@ -159,21 +167,29 @@ class Learner:
     # The next two methods decide what is compiled, and keep it in `_critic_loss`, `_actor_loss` and the actor rule.
 
     def _compile_critic_loss(self) -> None:
-        self._critic_loss: LossFunction = self._compiler()(self.loss.critic_loss)
+        self._critic_loss = self._compiler()(with_gradient(self.loss.critic_loss, self.loss.qvalue_network_params))
 
     def _compile_actor_loss(self) -> None:
         compiler, rule = self._compiler(), self.loss.actor_rule
         rule.compile(compiler)
-        self._actor_loss: LossFunction = compiler(self.loss.actor_loss) if rule.compiles_whole else self.loss.actor_loss
+        differentiated = with_gradient(self.loss.actor_loss, self.loss.actor_network_params)
+        self._actor_loss = compiler(differentiated) if rule.compiles_whole else differentiated
 
     def _compiler(self) -> Callable[[Any], Any]:
         return compiled if self.compile else lambda function: function
 
-    def _evaluated(self, which: Literal["critic", "actor"], batch: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """A loss and its terms; if compilation fails, the losses run eagerly from then on."""
+    def _differentiated(self, which: Literal["critic", "actor"], batch: TensorDictBase) -> tuple[Tensor, Terms]:
+        """A loss and its terms, with its gradient noted at the parameters.
 
-        def evaluate() -> tuple[Tensor, dict[str, Tensor]]:
-            return (self._critic_loss if which == "critic" else self._actor_loss)(batch)
+        If compilation fails, the losses run eagerly from then on.
+        """
+
+        def evaluate() -> tuple[Tensor, Terms]:
+            loss, terms, gradient = (self._critic_loss if which == "critic" else self._actor_loss)(batch)
+            params = self.loss.qvalue_network_params if which == "critic" else self.loss.actor_network_params
+            for parameter, entry in zip(params.parameters(), gradient, strict=True):
+                parameter.grad = entry
+            return loss, terms
 
         try:
             return evaluate()
@@ -187,14 +203,6 @@ class Learner:
             return evaluate()
 
     @staticmethod
-    def _step(parts: list[torch.optim.Optimizer], loss: Tensor) -> None:
-        for optimizer in parts:
-            optimizer.zero_grad()
-        loss.backward()
-        for optimizer in parts:
-            optimizer.step()
-
-    @staticmethod
     def _check(loss: Tensor, terms: dict[str, Tensor], update: int) -> None:
         if abs(loss.item()) < EXPLOSION:
             return
@@ -206,3 +214,14 @@ class Learner:
 def _name(rule: object) -> str:
     """The full name of the class of a rule, by which a checkpoint records it."""
     return type(rule).__qualname__
+
+
+def with_gradient(function: LossFunction, params: TensorDictParams) -> Differentiated:
+    """The loss with its gradient in the parameters, so that compiled code computes both in one program."""
+    parameters = tuple(params.parameters())
+
+    def differentiated(batch: TensorDictBase) -> tuple[Tensor, Terms, tuple[Tensor | None, ...]]:
+        loss, terms = function(batch)
+        return loss.detach(), terms, torch.autograd.grad(loss, parameters, allow_unused=True)
+
+    return differentiated

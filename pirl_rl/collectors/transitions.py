@@ -185,7 +185,7 @@ def _without_random(batch: TensorDictBase) -> TensorDictBase:
     if "loc" not in batch.keys():
         return batch.set("loc", batch["action"])
     if "played" in batch.keys():
-        own = (batch["played"] == batch["action"]).all(-1, keepdim=True)
+        own = torch.eq(batch["played"], batch["action"]).all(-1, keepdim=True)
         batch = batch.set("loc", torch.where(own, batch["loc"], batch["action"]))
         if "slope" in batch.keys():
             batch = batch.set("slope", torch.where(own, batch["slope"], 0.0))
