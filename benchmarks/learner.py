@@ -6,13 +6,16 @@ An update computes the TD, HJB and boundary losses with their gradients, makes a
 time updates the actor and the target networks too. All variants have equal networks, points, optimisers and loops.
 "nested autograd" differentiates both critics at once by one gradient with create_graph and one Hessian-vector product
 per noise channel. These derivatives cannot be compiled; the other terms run eagerly too, or compiled in "nested, others
-compiled". "HJB term" is this loss alone, forward and backward. The variants take turns of a few updates each, and times
-are medians over all turns.
+compiled". "HJB term" is this loss alone, forward and backward. "matrix products" are those of all forward and backward
+passes alone, eagerly through torch, without activations, samplers and optimisers: the floor of this machine.
+
+The variants take turns of a few updates each. Times are those of the processor, medians over all turns.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import statistics
 import time
 from collections.abc import Callable
@@ -157,19 +160,63 @@ class Variant:
         optimiser.step()
 
 
+class MatrixProducts:
+    """The matrix products of an update, forward and backward."""
+
+    def __init__(self, shape: Shape):
+        torch.manual_seed(0)
+        problem = shape.problem
+        n, m = problem.states.dim, problem.controls.dim
+        channels = problem.diffusion(torch.zeros(1, n), torch.zeros(1, m)).shape[-1]
+        self.actor, self.critics = _weights((), (1 + n, 32, 32, m)), _weights((2,), (1 + n + m, *shape.critic, 1))
+        self.transitions, self.boundary = shape.transitions, shape.boundary
+        self.points, self.rows = shape.collocation, (2 + channels) * shape.collocation
+        self.count = 0
+
+    def update(self) -> None:
+        self.count += 1
+        with torch.no_grad():
+            for count in (self.transitions, self.points, self.boundary):
+                _through(self.actor, count)
+            _through(self.critics, self.transitions)
+        for count in (self.transitions, self.rows, self.boundary):
+            _through(self.critics, count).sum().backward()
+        if self.count % 2 == 0:
+            _through(self.actor, self.transitions).sum().backward()
+            _through([weight.detach() for weight in self.critics], self.transitions, inputs=True).sum().backward()
+
+    def hjb(self) -> None:
+        with torch.no_grad():
+            _through(self.actor, self.points)
+        _through(self.critics, self.rows).sum().backward()
+
+
+def _weights(stacked: tuple[int, ...], widths: tuple[int, ...]) -> list[Tensor]:
+    return [torch.randn(*stacked, wide, width).requires_grad_() for width, wide in itertools.pairwise(widths)]
+
+
+def _through(weights: list[Tensor], count: int, inputs: bool = False) -> Tensor:
+    """The products of `count` rows with all weights; with `inputs`, the rows have a gradient and the weights none."""
+    rows = torch.ones(count, weights[0].shape[-1], requires_grad=inputs)
+    for weight in weights:
+        rows = torch.matmul(rows, weight.mT)
+    return rows
+
+
 def milliseconds(work: Callable[[], None], repeats: int) -> float:
-    start = time.perf_counter()
+    start = time.process_time()
     for _ in range(repeats):
         work()
-    return 1e3 * (time.perf_counter() - start) / repeats
+    return 1e3 * (time.process_time() - start) / repeats
 
 
 def measure(shape: Shape, rounds: int, updates: int) -> None:
-    variants = {
+    variants: dict[str, Variant | MatrixProducts] = {
         "nested autograd": Variant(shape, NestedLoss, compiled=False),
         "nested, others compiled": Variant(shape, NestedLoss, compiled=True),
         "ours, eager": Variant(shape, PIRLLoss, compiled=False),
         "ours, compiled": Variant(shape, PIRLLoss, compiled=True),
+        "matrix products": MatrixProducts(shape),
     }
     works = {(name, part): getattr(variant, part) for name, variant in variants.items() for part in ("update", "hjb")}
     for work in works.values():
