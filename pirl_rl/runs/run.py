@@ -203,8 +203,9 @@ class Run:
             time = self.problem.horizon if tau is None else tau
             checked_points(self.problem, time, [self.problem.states.low], self.solution.dtype, self.solution.device)
         else:
-            times, state, _ = self._starts(self.problem.horizon if tau is None else tau, [x])
-            where = OneStart(times.item(), tuple(state[0].tolist()))
+            time = self.problem.horizon if tau is None else tau
+            self._starts(time, [x])  # checks both
+            where = OneStart(float(time), tuple(torch.as_tensor(x, dtype=torch.float64).tolist()))
         names = claims if claims is not None else ("success",) if x is not None else ("success", "threshold", "band")
         certifiers = make_certifiers(names, episodes, at_least, states, rollouts, share, success)
         return certify(self.solution, simulator, where, certifiers, confidence, picked_from, seed, corollary)
