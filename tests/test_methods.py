@@ -155,7 +155,7 @@ def test_what_differs_from_the_constructors_stands_in_the_method_and_its_recipe(
     config = compose("train", ["+experiment=reach1d", f"method={method}"])
     chosen = {key for key, _ in owned(method)} | {"schedule.center", "schedule.steepness"}
     chosen |= {f"{simulator}.{name}" for simulator in ("env", "evaluation.simulator") for name in ("dt", "substeps")}
-    chosen |= {f"evaluation.{evaluator}.{argument}" for evaluator, argument in PATHS}
+    chosen |= {"loss.hjb_probes", *(f"evaluation.{evaluator}.{argument}" for evaluator, argument in PATHS)}
     if method == "pirl":
         recipe = OmegaConf.load(CONF / "recipe" / "any_problem.yaml")
         chosen |= {f"{group}.{name}" for group in recipe for name in recipe[group]}
