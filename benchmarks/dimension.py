@@ -130,11 +130,12 @@ def products(case: Case, probes: int) -> Callable[[], None]:
     """The products of matrices of a term: forward, and backward in the weights and in the inputs of a layer.
 
     The rows are values, drifts and columns of N points each. The first layer needs no gradient in its inputs, and the
-    random vectors that give the weight of Huber's loss need none at all.
+    random vectors that give the weight of Huber's loss need none at all. Both kinds are multiplied by sigma.
     """
     streams = (1, probes, probes) if probes else (1, 1, case.channels)
-    critic = Term(replace(case, points=1), probes).critic
-    steps: list[tuple[Tensor, Tensor]] = []
+    term = Term(replace(case, points=1), probes)
+    critic, draws = term.critic, torch.randn(probes * case.points, case.channels)
+    steps: list[tuple[Tensor, Tensor]] = [(draws, term.problem.matrix.mT)] * (2 if probes else 0)
     for index, layer in enumerate(layer for layer in critic.layers if isinstance(layer, Dense)):
         weight = layer.weight.detach()
         for count in streams:
@@ -270,7 +271,9 @@ def draw(sweeps: Mapping[str, Any]) -> Figure:
         panel.set_xticks(result["values"], [str(value) for value in result["values"]], minor=False)
         panel.set_xticks([], minor=True)
         panel.grid(alpha=0.3)
-        panel.legend(fontsize="small")
+        # Room for the legend above the curves.
+        panel.set_ylim(top=panel.get_ylim()[1] ** 1.5 / panel.get_ylim()[0] ** 0.5)
+        panel.legend(fontsize="small", loc="upper left")
     return figure
 
 

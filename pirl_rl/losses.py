@@ -69,7 +69,8 @@ class PIRLLoss(ScheduledTD3Loss):
             the paper.
         hjb_probes: 0 computes the trace of the HJB residual exactly, by one column for each noise channel. A number of
             at least 2 estimates it with so many random vectors at each point, see `pirl_rl.operators`, which costs less
-            where there are many channels; the loss and its gradient keep their means.
+            where there are many channels. Squared residuals and their gradient keep their means; with `hjb_delta`
+            the gradient has the right direction at each point on average.
         boundary_delta: the same for the error of V on the boundary, without unit.
         logit_penalty: factor of the mean square of the actor's outputs before their tanh, which is added to the actor's
             loss: a saturated tanh has no gradient that could correct a wrong action.

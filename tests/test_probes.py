@@ -217,14 +217,9 @@ def test_a_loss_with_levels_is_one_program():
 # Training
 
 
-def two_channels(compiled: str) -> tuple[str, ...]:
-    """A short training on a problem of two channels whose loss has probes."""
-    return ("env.problem._target_=pirl_rl.problems.HalfSpace", "loss.hjb_probes=2", *PHYSICS, f"compile={compiled}")
-
-
-@pytest.mark.parametrize("compiled", ["false", pytest.param("true", marks=pytest.mark.slow)])
-def test_a_training_with_probes_repeats_and_resumes_bit_for_bit(compiled, tmp_path):
-    settings = two_channels(compiled)
+def test_a_training_with_probes_repeats_and_resumes_bit_for_bit(tmp_path):
+    problem = "env.problem._target_=pirl_rl.problems.HalfSpace"
+    settings = (problem, "loss.hjb_probes=2", *PHYSICS, "compile=false")
     small_trainer(tmp_path / "whole", *settings).train()
     first = small_trainer(tmp_path / "cut", *settings)
     at_update(first, 7, interrupt)
