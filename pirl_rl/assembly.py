@@ -19,14 +19,18 @@ from pirl_rl.errors import ArgumentError, ConfigError
 from pirl_rl.evaluation import Evaluator
 from pirl_rl.grid import GridSolver
 from pirl_rl.networks import Actor, Critic
-from pirl_rl.problem import ReachAvoidProblem, check_problem
+from pirl_rl.problem import ReachAvoidProblem, check_problem, noise_channels
 from pirl_rl.sampling.initial_states import InitialStates
+from pirl_rl.schedules import WEIGHTS
 from pirl_rl.simulator import Simulator
 from pirl_rl.time_steps import check_time_steps, propose_time_steps
 from pirl_rl.trainer import Trainer
 
 AUTO = "auto"
-"""The value that leaves a choice to the package: env.dt, env.substeps, trainer.updates and the entries of `PATHS`."""
+"""The value that leaves a choice to the package.
+
+Keys that take it: env.dt, env.substeps, trainer.updates, loss.hjb_probes and the entries of `PATHS`.
+"""
 
 UPDATES_PER_DIMENSION, MOST_UPDATES = 3_500, 20_000
 """The number of updates that is chosen for each dimension of (tau, x), and the largest that is chosen."""
@@ -44,6 +48,12 @@ PROGRESS_SHARE = 5
 
 CHEAP_PATH = 10_000
 """The number of coordinates of all integration steps of a path up to which evaluators have the largest numbers."""
+
+MOST_COLUMNS = 16
+"""The largest number of noise channels with which the trace of the HJB residual is computed exactly."""
+
+PROBES = 4
+"""The number of random vectors that estimate the trace with more channels."""
 
 
 def pick_device(name: str) -> torch.device:
@@ -115,6 +125,7 @@ def make_trainer(
     choose_time_steps(config, problem)
     choose_updates(config, problem)
     choose_paths(config, problem)
+    reason = choose_probes(config, problem)
     supplied = {"problem": problem, "seed": physics, "device": device, "compile_simulator": config.compile}
     env: ReachAvoidEnv = build(_without_problem(config), "env", trust, **supplied)
     parts = {"problem": problem, "simulator": env.simulator}
@@ -126,7 +137,7 @@ def make_trainer(
         loss = build(config.loss, "loss", trust, parts, problem=problem, actor=actor, critics=critics).to(device)
     actor = loss.actor_network.module
     learned = parts | {"solution": loss.solution(), "others": env.initial_states, "compile": config.compile}
-    return build(
+    trainer: Trainer = build(
         config.trainer,
         "trainer",
         trust,
@@ -144,6 +155,9 @@ def make_trainer(
         config=OmegaConf.to_container(config, resolve=True),
         seed=points,
     )
+    if reason and trainer.curriculum.largest_weights()[WEIGHTS.index("hjb_weight")]:
+        print(f"trace: {reason}", flush=True)
+    return trainer
 
 
 def choose_time_steps(config: DictConfig, problem: ReachAvoidProblem) -> None:
@@ -188,6 +202,18 @@ def choose_paths(config: DictConfig, problem: ReachAvoidProblem) -> None:
     if config.evaluation.get("progress", {}).get("episodes") == AUTO:
         episodes = convert(config.evaluation.success.episodes, int, "evaluation.success.episodes")
         config.evaluation.progress.episodes = max(1, episodes // PROGRESS_SHARE)
+
+
+def choose_probes(config: DictConfig, problem: ReachAvoidProblem) -> str:
+    """Replace `auto` in loss.hjb_probes by a number, and give the reason where the trace is estimated, else ""."""
+    if config.loss.get("hjb_probes") != AUTO:
+        return ""
+    channels = noise_channels(problem)
+    config.loss.hjb_probes = PROBES if channels > MOST_COLUMNS else 0
+    if not config.loss.hjb_probes:
+        return ""
+    instead = f"{PROBES} random vectors in place of {channels} noise channels"
+    return f"The HJB residual takes {instead}; loss.hjb_probes=0 is exact."
 
 
 def _without_problem(config: DictConfig) -> DictConfig:

@@ -22,8 +22,8 @@ from pirl_rl.actor_rules import ActorRule
 from pirl_rl.errors import ArgumentError
 from pirl_rl.internals import ScheduledTD3Loss
 from pirl_rl.networks import Actor, Critic
-from pirl_rl.operators import generator, masked_mean, require_twice_differentiable
-from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.operators import generator, masked_mean, rademacher, require_twice_differentiable
+from pirl_rl.problem import ReachAvoidProblem, noise_channels
 from pirl_rl.schedules import WEIGHTS
 from pirl_rl.solution import Solution
 
@@ -67,6 +67,10 @@ class PIRLLoss(ScheduledTD3Loss):
         hjb_delta: size, in 1/s, beyond which an HJB residual counts linearly (Huber's loss), so that corners where V
             jumps faster than a network can follow do not outweigh all other points; None squares all residuals, as in
             the paper.
+        hjb_probes: 0 computes the trace of the HJB residual exactly, by one column for each noise channel. A number of
+            at least 2 estimates it with so many random vectors at each point, see `pirl_rl.operators`, which costs less
+            where there are many channels. Squared residuals and their gradient keep their means; with `hjb_delta`
+            the gradient has the right direction at each point on average.
         boundary_delta: the same for the error of V on the boundary, without unit.
         logit_penalty: factor of the mean square of the actor's outputs before their tanh, which is added to the actor's
             loss: a saturated tanh has no gradient that could correct a wrong action.
@@ -95,6 +99,7 @@ class PIRLLoss(ScheduledTD3Loss):
         hjb_noise: float = 0.0,
         hjb_noise_clip: float = 1.0,
         hjb_delta: float | None = 1.0,
+        hjb_probes: int = 0,
         boundary_delta: float | None = None,
         logit_penalty: float = 0.0,
         td_weight: float = 1.0,
@@ -109,6 +114,11 @@ class PIRLLoss(ScheduledTD3Loss):
             raise ArgumentError("loss.td_criterion: 'cross_entropy' needs critics with output 'Sigmoid'")
         if target_critics not in ("min", "mean"):
             raise ArgumentError(f"loss.target_critics: expected 'min' or 'mean', got {target_critics!r}")
+        if hjb_probes < 0 or hjb_probes == 1:
+            raise ArgumentError(
+                "loss.hjb_probes: expected 0 for the exact trace, or at least 2, since the square of a residual needs "
+                f"two independent estimates, got {hjb_probes}"
+            )
         for critic in critics:
             require_twice_differentiable(critic.layers)
         one = torch.ones(problem.controls.dim)
@@ -134,6 +144,7 @@ class PIRLLoss(ScheduledTD3Loss):
         self.td_criterion, self.target_critics = td_criterion, target_critics
         self.hjb_noise, self.hjb_noise_clip = hjb_noise, hjb_noise_clip
         self.hjb_delta, self.boundary_delta = hjb_delta, boundary_delta
+        self.hjb_probes, self.channels = hjb_probes, noise_channels(problem)
         self.actor_rule = actor_rule
         self.logit_penalty = logit_penalty
         for name, value in zip(WEIGHTS, (td_weight, hjb_weight, boundary_weight), strict=True):
@@ -216,10 +227,13 @@ class PIRLLoss(ScheduledTD3Loss):
         with params.to_module(self.qvalue_network, preserve_module_state=False):
             yield self.qvalue_network.module  # type: ignore[misc]
 
-    def _residuals(self, tau: Tensor, x: Tensor, action: Tensor, u: Tensor) -> Tensor:
-        """L^u Q_i(., action) (critics, N): tau (N,), x (N, n), the critics' frozen action and the physical u (N, m)."""
+    def _residuals(self, tau: Tensor, x: Tensor, action: Tensor, u: Tensor, probes: Tensor | None = None) -> Tensor:
+        """L^u Q_i(., action) (critics, N): tau (N,), x (N, n), the critics' frozen action and the physical u (N, m).
+
+        With probes (k, N, w) there are k estimates of each, (critics, k, N).
+        """
         with self._critics() as critic:
-            return generator(critic.at(action), self.problem, tau, x, u)
+            return generator(critic.at(action), self.problem, tau, x, u, probes)
 
     def _td_loss(self, replay: TensorDictBase, noise: Tensor) -> Tensor:
         """L_TD summed over critics: (Q_i - r - (1 - d) min_j Q_j^-(y', pi^-(y') + noise))^2."""
@@ -250,9 +264,33 @@ class PIRLLoss(ScheduledTD3Loss):
             if self.hjb_noise:
                 action = (action + self._clipped_noise(action, self.hjb_noise, self.hjb_noise_clip)).clamp(-1, 1)
             u = self.problem.controls.denormalize(action)
-        residual = self._residuals(points["tau"].squeeze(-1), points["state"], action, u)
-        squares = _huber(residual, self.hjb_delta)
+        inputs = points["tau"].squeeze(-1), points["state"], action, u
+        if self.hjb_probes:
+            squares = self._estimated_squares(*inputs)
+        else:
+            squares = _huber(self._residuals(*inputs), self.hjb_delta)
         return masked_mean(squares.sum(0), points["mask"])
+
+    def _estimated_squares(self, tau: Tensor, x: Tensor, action: Tensor, u: Tensor) -> Tensor:
+        """Unbiased estimates (critics, N) of r^2 for the residuals r of `_residuals`, from k independent probes.
+
+        The square of the mean of the k estimates of r has the mean r^2 + Var/k, from which the sample variance over k
+        is subtracted. For two probes what is left is the product r_1 r_2.
+
+        Huber's loss is a concave function H of r^2. With a delta the result is the tangent of H at the mean square
+        r_0^2 of k more estimates, which take no gradient: H(r_0^2) + H'(r_0^2) (r_1 r_2 - r_0^2). On average its
+        gradient is that of r^2 times the weight E H'(r_0^2), which is at most 1 and falls with r. If r_0 came from the
+        same probes, the loss would fall as the variance of the estimates grows.
+        """
+        probes = self.hjb_probes, x, self.channels
+        estimates = self._residuals(tau, x, action, u, rademacher(*probes))
+        square = estimates.mean(-2).square() - estimates.var(-2) / self.hjb_probes
+        if self.hjb_delta is None:
+            return square
+        with torch.no_grad():
+            size = self._residuals(tau, x, action, u, rademacher(*probes)).square().mean(-2).sqrt()
+        slope = (self.hjb_delta / size).clamp(max=1)
+        return _huber(size, self.hjb_delta) + slope * (square - size.square())
 
     def _boundary_loss(self, points: TensorDictBase) -> Tensor:
         """L_BC summed over critics: the mean of w (Q_i(y, pi^-(y)) - l_eps)^2 with the weights w of the points."""

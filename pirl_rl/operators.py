@@ -15,6 +15,16 @@ a = (-1, f) and one column s_j = (0, sigma_j) for each of the w noise channels. 
 The drift of the output is L^u V. This costs as much as 2 + w forward passes and builds no graph of derivatives, so that
 it can be compiled and one backward pass gives the gradient in the parameters, through the Hessian too. Other callables
 are differentiated by the forward mode of `torch.func`.
+
+With many noise channels the trace is estimated. For a random vector xi in R^w with E[xi xi^T] = I, a probe,
+
+    E[(sigma xi)^T hess V (sigma xi)] = Tr(sigma sigma^T hess V)
+
+(M. F. Hutchinson, Communications in Statistics - Simulation and Computation 18(3), 1989; for the residuals of networks
+Z. Hu, Z. Shi, G. E. Karniadakis, K. Kawaguchi, Hutchinson Trace Estimation for high-dimensional and high-order PINNs,
+2024). The one column sigma xi takes the place of the w columns of sigma. Each of k probes has a column and a drift of
+its own, which costs as much as 1 + 2 k forward passes. Its L^u V is unbiased, but the square of it is not: for two
+independent probes E[L_1 L_2] = (L^u V)^2, whereas E[L_1^2] is larger by the variance of L_1.
 """
 
 from __future__ import annotations
@@ -28,6 +38,7 @@ from pirl_rl.errors import ArgumentError
 from pirl_rl.layers import Dense, Levels, Periodic, RootTime, Scaling
 from pirl_rl.networks import CriticValue
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.sigma import times
 
 ValueFunction = Callable[[Tensor, Tensor], Tensor]
 
@@ -63,7 +74,9 @@ ACTIVATIONS: dict[type[nn.Module], Callable[[Tensor], tuple[Tensor, Tensor, Tens
 """phi, phi' and phi'' of the activations that Ito propagation supports; all are C^2, since L^u is of second order."""
 
 
-def generator(value: ValueFunction, problem: ReachAvoidProblem, tau: Tensor, x: Tensor, u: Tensor) -> Tensor:
+def generator(
+    value: ValueFunction, problem: ReachAvoidProblem, tau: Tensor, x: Tensor, u: Tensor, probes: Tensor | None = None
+) -> Tensor:
     """L^u V at points, Eq. (parabolic_operator).
 
     Args:
@@ -72,11 +85,16 @@ def generator(value: ValueFunction, problem: ReachAvoidProblem, tau: Tensor, x: 
         tau: times to go (N,), in s.
         x: states (N, n).
         u: physical controls (N, m), the arguments of f and sigma; the result is differentiable in them.
+        probes: random vectors (k, N, w), see `rademacher`, each of which gives an unbiased estimate of L^u V; without
+            them the result is exact.
 
     Returns:
-        L^u V (N,), in 1/s, or (critics, N) for a critic with stacked parameters.
+        L^u V (N,), in 1/s, or (critics, N) for a critic with stacked parameters; with probes (k, N) or (critics, k, N).
     """
-    return _along(value, tau, x, problem.drift(x, u), problem.diffusion(x, u))
+    sigma = problem.diffusion(x, u)
+    if probes is not None:
+        return _along(value, tau, x, problem.drift(x, u), times(sigma, probes).unsqueeze(1))
+    return _along(value, tau, x, problem.drift(x, u), sigma.movedim(-1, 0).unsqueeze(0)).squeeze(-2)
 
 
 def advection(value: ValueFunction, problem: ReachAvoidProblem, tau: Tensor, x: Tensor, u: Tensor) -> Tensor:
@@ -84,28 +102,36 @@ def advection(value: ValueFunction, problem: ReachAvoidProblem, tau: Tensor, x: 
 
     If sigma does not depend on u, this differs from L^u V by a term without u.
     """
-    return _along(value, tau, x, problem.drift(x, u), x.new_zeros((*x.shape, 0)))
+    return _along(value, tau, x, problem.drift(x, u), x.new_zeros((1, 0, *x.shape))).squeeze(-2)
 
 
-def _along(value: ValueFunction, tau: Tensor, x: Tensor, f: Tensor, sigma: Tensor) -> Tensor:
-    """The drift of V along the SDE with f (N, n) and sigma (N, n, w)."""
+def rademacher(count: int, x: Tensor, channels: int) -> Tensor:
+    """Probes (count, N, channels) for states x (N, n): independent signs -1 and 1, from the default random generator.
+
+    Among all laws of independent entries they give the trace the smallest variance; for one channel it is exact.
+    """
+    return torch.where(torch.rand(count, len(x), channels, dtype=x.dtype, device=x.device) < 0.5, -1.0, 1.0).to(x)
+
+
+def _along(value: ValueFunction, tau: Tensor, x: Tensor, f: Tensor, columns: Tensor) -> Tensor:
+    """The drifts (*, k, N) of V along k SDEs with one f (N, n), each with c columns of noise, (k, c, N, n) together."""
     if isinstance(value, CriticValue):
-        return _ito_drift(value, tau, x, f, sigma)
-    return _forward_mode(value, tau, x, f, sigma)
+        return _ito_drift(value, tau, x, f, columns)
+    return _forward_mode(value, tau, x, f, columns)
 
 
-def _ito_drift(value: CriticValue, tau: Tensor, x: Tensor, f: Tensor, sigma: Tensor) -> Tensor:
+def _ito_drift(value: CriticValue, tau: Tensor, x: Tensor, f: Tensor, columns: Tensor) -> Tensor:
     z = value.critic.inputs(tau.unsqueeze(-1), x, value.action)
     rest = z.shape[-1] - 1 - x.shape[-1]
     a = nn.functional.pad(torch.cat([-torch.ones_like(tau).unsqueeze(-1), f], -1), (0, rest))
-    s = nn.functional.pad(sigma.movedim(-1, 0), (1, rest))
+    a, s = a.expand(len(columns), *a.shape), nn.functional.pad(columns, (1, rest))
     for layer in value.critic.layers:
         z, a, s = _propagate(layer, z, a, s)
     return a.squeeze(-1)
 
 
 def _propagate(layer: nn.Module, z: Tensor, a: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Map the value z (*, N, d), its drift a (*, N, d) and its columns s (*, w, N, d) through one layer."""
+    """Map the value z (*, N, d), k drifts a (*, k, N, d) and their columns s (*, k, c, N, d) through one layer."""
     if isinstance(layer, RootTime):
         # d sqrt(tau + tau_0) = d tau / (2 sqrt(tau + tau_0)), and tau has no noise.
         root = layer(z)
@@ -115,42 +141,48 @@ def _propagate(layer: nn.Module, z: Tensor, a: Tensor, s: Tensor) -> tuple[Tenso
         rate, kicks = _along_levels(layer.levels, *(layer.of(entry) for entry in (z, a, s)))
         return layer(z), torch.cat([a, rate], -1), torch.cat([s, kicks], -1)
     if isinstance(layer, Scaling):
-        return layer(z), a * layer.scale.unsqueeze(-2), s * layer.scale[..., None, None, :]
+        return layer(z), a * layer.scale[..., None, None, :], s * layer.scale[..., None, None, None, :]
     if isinstance(layer, Dense):
         weight = layer.weight.mT
-        columns = torch.matmul(s.flatten(-3, -2), weight).unflatten(-2, s.shape[-3:-1])
-        return layer(z), torch.matmul(a, weight), columns
+        drifts = torch.matmul(a.flatten(-3, -2), weight).unflatten(-2, a.shape[-3:-1])
+        columns = torch.matmul(s.flatten(-4, -2), weight).unflatten(-2, s.shape[-4:-1])
+        return layer(z), drifts, columns
     if isinstance(layer, Periodic):
         z, a, s = layer.widened(z), layer.widened(a), layer.widened(s)
         y, slope, curvature = layer.waves(z)
     else:
         y, slope, curvature = ACTIVATIONS[type(layer)](z)
+    slope, curvature = slope.unsqueeze(-3), curvature.unsqueeze(-3)
     return y, slope * a + curvature * s.square().sum(-3) / 2, slope.unsqueeze(-3) * s
 
 
-def _along_levels(levels: Callable[[Tensor], Tensor], x: Tensor, f: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
-    """The drift (N, k) and the columns (w, N, k) of levels at x (N, n), along f (N, n) and sigma (w, N, n)."""
+def _along_levels(levels: Callable[[Tensor], Tensor], x: Tensor, f: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
+    """The drifts (k, N, j) and columns (k, c, N, j) of j levels at x (N, n), along f (k, N, n) and (k, c, N, n)."""
 
-    def along(function: Callable[[Tensor], Tensor], tangent: Tensor) -> Callable[[Tensor], Tensor]:
-        return lambda y: torch.func.jvp(function, (y,), (tangent,))[1]
+    def along(tangent: Tensor) -> Callable[[Tensor], Tensor]:
+        return lambda y: torch.func.jvp(levels, (y,), (tangent,))[1]
 
-    rate = along(levels, f)(x)
-    if not len(sigma):
-        return rate, rate.new_zeros((0, *rate.shape))
-    # All columns at once: a loop over them would be compiled column by column.
-    everywhere, kick = x.repeat(len(sigma), 1, 1), along(levels, sigma)
-    return rate + along(kick, sigma)(everywhere).sum(0) / 2, kick(everywhere)
+    def twice(column: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.func.jvp(along(column), (x,), (column,))[:2]
+
+    rate = torch.func.vmap(lambda drift: along(drift)(x))(f)
+    if not columns.shape[1]:
+        return rate, rate.new_zeros((len(f), 0, *rate.shape[1:]))
+    # The columns are an axis of `vmap` and not of the states: the compiler's nested forward mode fails where a level
+    # broadcasts a constant over the states, as in x * c.
+    kicks, curvatures = (part.unflatten(0, columns.shape[:2]) for part in torch.func.vmap(twice)(columns.flatten(0, 1)))
+    return rate + curvatures.sum(1) / 2, kicks
 
 
-def _forward_mode(value: ValueFunction, tau: Tensor, x: Tensor, f: Tensor, sigma: Tensor) -> Tensor:
+def _forward_mode(value: ValueFunction, tau: Tensor, x: Tensor, f: Tensor, columns: Tensor) -> Tensor:
     def along(tangent_tau: Tensor, tangent_x: Tensor) -> Callable[[Tensor, Tensor], Tensor]:
         return lambda t, y: torch.func.jvp(value, (t, y), (tangent_tau, tangent_x))[1]
 
-    result = along(-torch.ones_like(tau), f)(tau, x)
-    still = torch.zeros_like(tau)
-    for column in sigma.unbind(-1):
-        result = result + torch.func.jvp(along(still, column), (tau, x), (still, column))[1] / 2
-    return result
+    def second(column: Tensor) -> Tensor:
+        return torch.func.jvp(along(still, column), (tau, x), (still, column))[1]
+
+    first, still = along(-torch.ones_like(tau), f)(tau, x), torch.zeros_like(tau)
+    return torch.stack([sum((second(column) / 2 for column in own), first) for own in columns], -2)
 
 
 def require_twice_differentiable(layers: nn.Sequential) -> None:

@@ -162,6 +162,12 @@ class ReachAvoidProblem(ABC):
         return alive * self.payoff(_normalized(self.target_constraints, x).amax(-1))
 
 
+def noise_channels(problem: ReachAvoidProblem) -> int:
+    """The number w of columns of sigma."""
+    x, u = (box.denormalize(torch.zeros(1, box.dim)) for box in (problem.states, problem.controls))
+    return problem.diffusion(x, u).shape[-1]
+
+
 def has_controlled_noise(problem: ReachAvoidProblem, points: int = 256, seed: int = 0) -> bool:
     """Whether sigma depends on u, judged by `points` sampled states, each with two sampled controls."""
     rng = torch.Generator().manual_seed(seed)

@@ -46,9 +46,12 @@ def constant_matrix(diffusion: Callable[[Tensor, Tensor], Tensor], x: Tensor, u:
 
 
 def times(sigma: Tensor, z: Tensor) -> Tensor:
-    """sigma z (N, n) of sigma (N, n, w) and z (N, w)."""
+    """sigma z (N, n) of sigma (N, n, w) and z (N, w), or (k, N, n) of k of them, z (k, N, w)."""
     if _is_one_matrix(sigma):
         return (_one_matrix(sigma) @ z.mT).mT
+    if z.ndim > 2:
+        # One product of matrices for each state serves all z, and no (k, N, n, w) products of entries is stored.
+        return torch.einsum("nij,knj->kni", sigma, z)
     return (sigma * z.unsqueeze(-2)).sum(-1)
 
 

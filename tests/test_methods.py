@@ -155,6 +155,7 @@ def test_what_differs_from_the_constructors_stands_in_the_method_and_its_recipe(
     config = compose("train", ["+experiment=reach1d", f"method={method}"])
     chosen = {key for key, _ in owned(method)} | {"schedule.center", "schedule.steepness"}
     chosen |= {f"{simulator}.{name}" for simulator in ("env", "evaluation.simulator") for name in ("dt", "substeps")}
+    chosen |= {"loss.hjb_probes", "evaluation.progress.episodes"}
     chosen |= {f"evaluation.{evaluator}.{argument}" for evaluator, argument in PATHS}
     if method == "pirl":
         recipe = OmegaConf.load(CONF / "recipe" / "any_problem.yaml")

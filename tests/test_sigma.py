@@ -14,6 +14,8 @@ def test_products_are_those_of_matrices(one):
     sigma = torch.randn((3, 2) if one else (5, 3, 2), generator=rng, dtype=torch.float64).expand(5, 3, 2)
     z, a = (torch.randn(5, width, generator=rng, dtype=torch.float64) for width in (2, 3))
     torch.testing.assert_close(times(sigma, z), torch.einsum("nij,nj->ni", sigma, z))
+    pair = torch.randn(2, 5, 2, generator=rng, dtype=torch.float64)
+    torch.testing.assert_close(times(sigma, pair), torch.einsum("nij,knj->kni", sigma, pair))
     torch.testing.assert_close(transposed_times(sigma, a), torch.einsum("nij,ni->nj", sigma, a))
 
 

@@ -8,10 +8,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from markupsafe import Markup
 
-from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.problem import ReachAvoidProblem, noise_channels
 from pirl_rl.reports.equations import MOST_ROWS, equations
 from pirl_rl.reports.names import as_html, control_names, split_unit, state_names
 from pirl_rl.reports.outlines import outlines
@@ -56,8 +55,6 @@ class Statement:
     @classmethod
     def of(cls, problem: ReachAvoidProblem, planes: Mapping[str, Plane]) -> Statement:
         kind, states, controls = type(problem), problem.states, problem.controls
-        like = torch.zeros(1, dtype=torch.float64)
-        middle = [entry.center_and_half_width(like)[0].unsqueeze(0) for entry in (states, controls)]
         return cls(
             name=kind.__name__,
             module=kind.__module__,
@@ -66,7 +63,7 @@ class Statement:
             horizon=problem.horizon,
             objective=problem.objective,
             payoff=(type(problem.payoff).__name__, problem.payoff.epsilon),
-            counts=(states.dim, controls.dim, problem.diffusion(*middle).shape[-1]),
+            counts=(states.dim, controls.dim, noise_channels(problem)),
             states=_table(state_names(problem), states),
             controls=_table(control_names(problem), controls),
             equations=equations(problem),
