@@ -43,7 +43,6 @@ SLAB = 1e-9
 The bound is not about states that are this close to a side.
 """
 
-
 CAUTION = 1e-12
 """By this the parts of boxes that contain the zeros of a level are widened, for rounding."""
 

@@ -16,8 +16,11 @@ from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.proofs.boxes import Boxes
 from pirl_rl.proofs.spline import Spline
 
-STATES, LEVELS = 20_000, (0.5, 0.8, 0.9)
-"""The number of states, and the probabilities, by which a proved bound is described."""
+STATES = 20_000
+"""The number of states by which a proved bound is described."""
+
+LEVELS = (0.5, 0.8, 0.9)
+"""The probabilities of which a proof says how large a share of the box of states has at least them."""
 
 LISTED = 20
 """The largest number of boxes that resist which are listed for each condition."""

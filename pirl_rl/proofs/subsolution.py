@@ -26,8 +26,11 @@ from pirl_rl.proofs.spline import DEGREE, Spline, design
 RAMP = 0.1
 """The share of the horizon in which W rises at the target from 0 to 1, without which it would jump at tau = 0."""
 
-WIDTH, CELLS = 0.15, 4
-"""W falls to 0 towards faces at tau = 0 over this share of the depth of the safe set, and this number of cells."""
+WIDTH = 0.15
+"""At tau = 0 W falls to 0 towards the face of B over this share of the depth of the safe set at least."""
+
+CELLS = 4
+"""At tau = 0 W falls to 0 towards faces over this number of cells at least."""
 
 FIRST_STEPS = 4
 """The number of first steps in time that are implicit, which damp what the trapezoidal rule does not."""
