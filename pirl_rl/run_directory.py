@@ -9,6 +9,7 @@ summary.json            the verdict, the metrics of the final evaluation, and th
 evaluation.json         the metrics of a later `python -m pirl_rl.evaluate`
 certificate.json        the claims of `python -m pirl_rl.certify`
 proof.json, proof.npz   what `python -m pirl_rl.certify method=interval` proved, in words and as a function
+limit.json, limit.npz   what it proved of all policies, with bounds=[upper]
 checkpoints/            last.pt, from which the run can be resumed, and weights-<update>.pt with the networks
 grid.npz                the value and the policy on a mesh, in place of checkpoints, of a run with method=grid
 figures/                PNG files
@@ -45,6 +46,8 @@ class RunDirectory:
     CERTIFICATE = Path("certificate.json")
     PROOF = Path("proof.json")
     BOUND = Path("proof.npz")
+    LIMIT = Path("limit.json")
+    LIMIT_BOUND = Path("limit.npz")
     CHECKPOINTS = Path("checkpoints")
     LAST = CHECKPOINTS / "last.pt"
     GRID = Path("grid.npz")
@@ -124,8 +127,17 @@ class RunDirectory:
 
     @property
     def bound(self) -> Path:
-        """The function that is a proved lower bound of the probability of success."""
+        """The function that is a proved lower bound of the policy's probability of success."""
         return self.path / self.BOUND
+
+    @property
+    def limit(self) -> Path:
+        return self.path / self.LIMIT
+
+    @property
+    def limit_bound(self) -> Path:
+        """The function that is a proved upper bound of every policy's probability of success."""
+        return self.path / self.LIMIT_BOUND
 
     @property
     def checkpoints(self) -> Path:

@@ -19,9 +19,10 @@ from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.grid import GridSolver
 from pirl_rl.networks import Actor
 from pirl_rl.problems import DoubleIntegrator, DubinsCar, Exit1D, HalfSpace, Pendulum, Reach1D, Safety1D, ZermeloBoat
-from pirl_rl.proofs import Proof, Settings, prove_success
+from pirl_rl.proofs import LowerBound, Settings, prove_success
 from pirl_rl.proofs.affine import Affine
 from pirl_rl.proofs.boxes import Boxes
+from pirl_rl.proofs.ends import Ends
 from pirl_rl.proofs.faces import face_points, smooth_target
 from pirl_rl.proofs.mesh import mesh_of, product
 from pirl_rl.proofs.search import prove
@@ -246,7 +247,7 @@ def constant(sign: float) -> Feedback:
     return Feedback(0.0, offset=4.0 * sign)
 
 
-def assert_no_point_violates(proof: Proof, solution: Stand, count: int) -> None:
+def assert_no_point_violates(proof: LowerBound, solution: Stand, count: int) -> None:
     """L^pi W >= 0 at sampled points where W - margin > 0, by another library's splines."""
     problem, rng = solution.problem, torch.Generator().manual_seed(5)
     x = problem.states.sample(count, rng, torch.float64)
@@ -363,20 +364,36 @@ def test_a_proof_is_read_for_its_networks_alone(tmp_path):
     proof = prove_success(Stand(Reach1D(), constant(1.0)), "a" * 64)
     proof.save(tmp_path / "proof.npz")
     points = np.full(3, 1.5), np.array([[-1.0], [0.0], [1.0]])
-    assert (Proof.load(tmp_path / "proof.npz", "a" * 64).bound(*points) == proof.bound(*points)).all()
+    assert (LowerBound.load(tmp_path / "proof.npz", Reach1D(), "a" * 64).bound(*points) == proof.bound(*points)).all()
     with pytest.raises(ProofError, match="networks with SHA-256 aaaaaaaaaaaa, and those of this run have bbbbbbbbbbbb"):
-        Proof.load(tmp_path / "proof.npz", "b" * 64)
+        LowerBound.load(tmp_path / "proof.npz", Reach1D(), "b" * 64)
     (tmp_path / "proof.npz").write_bytes(b"no proof")
     with pytest.raises(ProofError, match="expected a file of `certify method=interval`"):
-        Proof.load(tmp_path / "proof.npz", "a" * 64)
+        LowerBound.load(tmp_path / "proof.npz", Reach1D(), "a" * 64)
     with pytest.raises(ProofError, match="expected a file of `certify method=interval`"):
-        Proof.load(tmp_path / "missing.npz", "a" * 64)
+        LowerBound.load(tmp_path / "missing.npz", Reach1D(), "a" * 64)
+
+
+def flat(edges: list[np.ndarray], level: float) -> LowerBound:
+    """W = level for Reach1D, with a margin of 0.1."""
+    spline = Spline(edges, np.full([len(axis) + 2 for axis in edges], level))
+    return LowerBound(problem=Reach1D(), spline=spline, margin=0.1, resisted={}, boxes=0, seconds=0.0, networks="none")
+
+
+def test_a_proof_holds_where_it_says_something_of_states_outside_the_sets():
+    """W is above its margin in A alone, where it has no meaning."""
+    edges = [np.linspace(0, 2, 3), np.linspace(-2, 2.4, 45)]
+    assert flat(edges, 1.0).holds
+    assert not flat(edges, 0.0).holds
+    proof = flat(edges, 0.0)
+    proof.spline.coefficients[:, -2:] = 1.0
+    assert not proof.holds
 
 
 @pytest.mark.parametrize(("tau", "x"), [(2.5, 0.0), (-0.1, 0.0), (1.0, -3.0), (1.0, math.nan)])
 def test_a_bound_is_given_within_its_box_alone(tau, x):
     edges = [np.linspace(0, 2, 3), np.linspace(-2, 2, 5)]
-    proof = Proof(Spline(edges, np.ones((5, 7))), 0.1, {}, 0, "none", 0.0)
+    proof = flat(edges, 1.0)
     assert proof.bound(np.array([1.0]), np.array([[0.0]]))[0] == pytest.approx(0.9)
     with pytest.raises(ProofError, match=r"bound: expected \(tau, x\) between \[0.0, -2.0\] and \[2.0, 2.0\]"):
         proof.bound(np.array([tau]), np.array([[x]]))
@@ -385,9 +402,10 @@ def test_a_bound_is_given_within_its_box_alone(tau, x):
 def test_the_target_without_corners_lies_in_the_target():
     """Points of its face are on its level, in A, and close to A's face where that has no corner."""
     problem = DoubleIntegrator()
-    mesh = mesh_of(problem, 40, 10)
+    ends = Ends(problem, success=True)
+    mesh = mesh_of(ends, 40, 10)
     x = product(mesh.points([0.5]))
-    level = smooth_target(problem, torch.from_numpy(x))
+    level = smooth_target(ends, torch.from_numpy(x))
     points = face_points(level, mesh, x)
     assert len(points) > 20
     assert level(torch.from_numpy(points)).abs().max() < 1e-9
@@ -412,7 +430,7 @@ def test_a_grid_has_no_network_to_prove():
 
 
 def test_a_side_in_the_target_is_moved_outward():
-    mesh = mesh_of(Exit1D(), 10, 10)
+    mesh = mesh_of(Ends(Exit1D(), success=True), 10, 10)
     assert mesh.edges[1][0] == -1
     assert mesh.edges[1][-1] == pytest.approx(1.1)
 
@@ -445,7 +463,7 @@ def test_the_command_writes_a_proof(trained, in_process):
     ("arguments", "message"),
     [
         (["method=intervall"], "method: expected statistical or interval, got 'intervall'"),
-        (["method=interval", "episodes=5"], "episodes=5: expected key=value with a key out of cells, halvings"),
+        (["method=interval", "episodes=5"], "episodes=5: expected key=value with a key out of bounds, cells, halvings"),
         (["method=interval", "cells=0"], "cells: expected an integer >= 8, got 0"),
     ],
 )

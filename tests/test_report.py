@@ -60,6 +60,9 @@ CERTIFICATE = {
 PROOF = {"holds": True, "method": "affine arithmetic", "boxes": 21_128, "seconds": 5.41, "mean": 0.5672222309409455}
 PROOF |= {"best": 0.9949869437373761, "best_state": [1.9997992439749144]}
 PROOF |= {f"share_at_least_{level:g}": 1 - level for level in (0.5, 0.8, 0.9)}
+LIMIT = {"holds": True, "method": "affine arithmetic", "boxes": 12_179, "seconds": 1.9, "mean": 0.6543}
+LIMIT |= {"lowest": 0.2871, "lowest_state": [-1.6], "margin": 0.0125, "resisted": {"interior": [[1.0, 0.0, 0.0]]}}
+LIMIT |= {f"share_below_{level:g}": level / 2 for level in (0.5, 0.8, 0.9)}
 
 
 class Page(HTMLParser):
@@ -118,6 +121,7 @@ def folder(tmp_path_factory) -> Path:
     networks = page.Contents.of(path, page.Budget(10**6, 10**6)).networks
     (path / "certificate.json").write_text(json.dumps(CERTIFICATE | {"networks": networks}))
     (path / "proof.json").write_text(json.dumps(PROOF | {"networks": "of another run"}))
+    (path / "limit.json").write_text(json.dumps(LIMIT))
     (path / "figures").mkdir()
     for name in ("value", "calibration", "mine"):
         Image.new("RGB", (1600, 900), "white").save(path / "figures" / f"{name}.png")
@@ -171,7 +175,7 @@ def test_the_page_runs_its_own_scripts_alone(drawn):
 
 def test_every_number_is_that_of_its_file(drawn, folder):
     shown = Page(drawn).shown
-    names = ("summary.json", "evaluation.json", "certificate.json", "proof.json")
+    names = ("summary.json", "evaluation.json", "certificate.json", "proof.json", "limit.json")
     files = {name: json.loads((folder / name).read_text()) for name in names}
     assert {attributes["data-source"].partition(":")[0] for attributes, _ in shown} == {*files}
     for attributes, text in shown:
@@ -201,6 +205,10 @@ def test_the_page_says_what_there_is(drawn):
     ):
         assert text in words, text
     assert words.count("made for other networks") == 1  # of the proof, and not of the certificate
+    # No function of the limit lies beside its numbers, from which the problem could be told.
+    assert words.count("made for another problem") == 1
+    assert "no policy succeeds with a probability above 0.2871" in words
+    assert "The bound is raised by 0.0125" in words
 
 
 def test_the_same_directory_gives_the_same_bytes(drawn, folder, tmp_path):
@@ -383,7 +391,8 @@ def test_a_certificate_that_lacks_an_entry_is_one_sentence(folder, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(folder, copy)
     (copy / "certificate.json").write_text(json.dumps(CERTIFICATE | {"claims": {"success": {"holds": True}}}))
-    with pytest.raises(RunError, match=r"expected all entries of certificate\.json or proof\.json, .*sentences"):
+    message = r"expected all entries of certificate\.json or proof\.json or limit\.json, .*sentences"
+    with pytest.raises(RunError, match=message):
         write_report([copy], tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
 

@@ -9,7 +9,9 @@ which the best one is shown. The report of the run is drawn again.
 
 With method=interval it proves a lower bound of the probability of success for all states at once, with certainty, and
 writes it to proof.json and proof.npz, with figures. The bound is about continuous feedback, and the statistical claims
-are about the simulator, which holds each control for a step. Problems have at most three states.
+are about the simulator, which holds each control for a step. With bounds=[upper] it proves an upper bound for every
+policy, which does not depend on the networks, and writes it to limit.json and limit.npz. Problems have at most three
+states.
 
     run          the directory of a finished run
     claims       success: a lower bound of the probability of success;
@@ -31,6 +33,8 @@ are about the simulator, which holds each control for a step. Problems have at m
     trust        modules of your own that the run may import, such as trust=[my_module]
 
     With method=interval:
+    bounds       lower: a bound of the policy's probability of success from below, the default;
+                 upper: one of every policy's from above; [lower,upper]: both
     cells, steps the numbers of cells of the bound along each state and along tau, 64 and 60 by default
     rounds       the largest number of times that the bound is fitted, to points and then to boxes, 40 by default
     halvings     the number of times that a box may be halved, 10 by default
@@ -39,7 +43,7 @@ Examples:
     python -m pirl_rl.certify run=runs/reach1d/2026-01-31_12-00-00-0
     python -m pirl_rl.certify run=models/drift claims=[success] at_least=0.3
     python -m pirl_rl.certify run=my_run tau=2 x=[0.0] confidence=0.99
-    python -m pirl_rl.certify run=runs/reach1d/2026-01-31_12-00-00-0 method=interval
+    python -m pirl_rl.certify run=runs/reach1d/2026-01-31_12-00-00-0 method=interval bounds=[lower,upper]
 """
 
 from __future__ import annotations
@@ -47,7 +51,7 @@ from __future__ import annotations
 import inspect
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,11 +60,12 @@ from omegaconf.errors import OmegaConfBaseException
 
 from pirl_rl.commands.console import quiet_libraries, reported
 from pirl_rl.commands.report import draw_again
-from pirl_rl.errors import ConfigError
+from pirl_rl.errors import ConfigError, ProofError
 from pirl_rl.figures.files import save_figures
 from pirl_rl.figures.proof import draw_proof
 from pirl_rl.files import replacing
 from pirl_rl.progress import announce, helped
+from pirl_rl.proofs import LowerBound, UpperBound
 from pirl_rl.proofs.proof import LEVELS
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.runs.load import load_run
@@ -68,9 +73,12 @@ from pirl_rl.runs.run import Run
 
 SETTINGS = {
     "statistical": {*inspect.signature(Run.certify).parameters} - {"self", "starts"},
-    "interval": {*inspect.signature(Run.prove).parameters} - {"self"},
+    "interval": ({*inspect.signature(Run.prove).parameters} - {"self"}) | {"bounds"},
 }
-"""The arguments of `Run.certify` and `Run.prove` that have a place on a command line, by method."""
+"""The arguments of a command line, which are those of `Run.certify`, `Run.prove` and `Run.prove_limit`, by method."""
+
+BOUNDS = ("lower", "upper")
+"""The bounds that can be proved."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -109,27 +117,33 @@ def _certify(run: Run, directory: RunDirectory, settings: dict[str, Any]) -> lis
 
 
 def _prove(run: Run, directory: RunDirectory, settings: dict[str, Any]) -> list[str]:
-    """Write a proof, and return what it says."""
+    """Write proofs and draw them, and return what they say."""
+    wanted = settings.pop("bounds", ["lower"])
+    if not (isinstance(wanted, list) and wanted and set(wanted) <= {*BOUNDS}):
+        raise ConfigError(f"bounds: expected a list of {' and '.join(BOUNDS)}, got {wanted!r}")
+    lines = []
+    if "lower" in wanted:
+        lines += _prove_success(run, directory, settings)
+    if "upper" in wanted:
+        lines += _prove_limit(run, directory, settings)
+    for path in directory.figures.glob("proof*.png"):
+        path.unlink()  # of earlier proofs
+    lower, upper = _loaded(run.load_proof, directory.bound), _loaded(run.load_limit, directory.limit_bound)
+    if lower is not None and upper is not None:
+        lines.append(
+            f"gap       On average over the box of states the policy is within {upper.gap(lower):.4f} of the best one."
+        )
+    bounds = [bound for bound in (lower, upper) if bound is not None]
+    figures = save_figures(draw_proof(run.solution, bounds), directory.figures) if bounds else []
+    return [*lines, *(f"written   {path}" for path in figures)]
+
+
+def _prove_success(run: Run, directory: RunDirectory, settings: dict[str, Any]) -> list[str]:
     proof = run.prove(**settings)
-    found = proof.to_dict(run.problem)
-    with replacing(directory.proof) as file:
-        file.write(json.dumps(found, indent=2) + "\n")
-    for path in (directory.bound, *directory.figures.glob("proof*.png")):
-        path.unlink(missing_ok=True)  # of an earlier proof
-    lowered = [f"          W is lowered by {proof.margin:.3f}, so that it holds also on these boxes:"]
-    lowered += [f"resists   {name}, {len(boxes):,} boxes" for name, boxes in proof.resisted.items()]
-    resists = lowered if proof.resisted else []
-    if not proof.holds:
-        return [
-            "Nothing is proved: with the margin that its conditions need the bound is 0.",
-            *resists,
-            f"written   {directory.proof}",
-        ]
-    proof.save(directory.bound)
-    figures = save_figures(draw_proof(run.solution, proof), directory.figures)
-    horizon = run.problem.horizon
-    return [
-        f"proved    Under continuous feedback the policy succeeds from {found['best_state']} with {horizon:g} s to go",
+    found = proof.to_dict()
+    lines = [
+        f"proved    Under continuous feedback the policy succeeds from {found['best_state']} with "
+        f"{run.problem.horizon:g} s to go",
         f"          with probability at least {found['best']:.4f}, and on average over the box of states at least "
         f"{found['mean']:.4f}.",
         *(
@@ -137,10 +151,58 @@ def _prove(run: Run, directory: RunDirectory, settings: dict[str, Any]) -> list[
             for level in LEVELS
         ),
         "          The bound is not about a simulator, which holds each control for a step.",
-        *resists,
-        f"boxes     {proof.boxes:,}, in {proof.seconds:.0f} s",
-        *(f"written   {path}" for path in (directory.proof, directory.bound, *figures)),
     ]
+    return _written(proof, directory.proof, directory.bound, lines)
+
+
+def _prove_limit(run: Run, directory: RunDirectory, settings: dict[str, Any]) -> list[str]:
+    limit = run.prove_limit(**settings)
+    found = limit.to_dict()
+    lines = [
+        f"limit     No policy succeeds from {found['lowest_state']} with {run.problem.horizon:g} s to go",
+        f"          with a probability above {found['lowest']:.4f}, and on average over the box of states none does "
+        f"with more than {found['mean']:.4f}.",
+        *(
+            f"          From {found[f'share_below_{level:g}']:.1%} of it no policy attains {level:g}."
+            for level in LEVELS
+        ),
+        "          The bound does not depend on the networks.",
+    ]
+    return _written(limit, directory.limit, directory.limit_bound, lines)
+
+
+def _written(proof: LowerBound | UpperBound, words: Path, function: Path, lines: list[str]) -> list[str]:
+    """Write a proof to its two files, of which the function is left out where nothing is proved.
+
+    Args:
+        proof: what was found.
+        words: the JSON file.
+        function: the file of the bound.
+        lines: what the proof says if it holds.
+
+    Returns:
+        What to print.
+    """
+    with replacing(words) as file:
+        file.write(json.dumps(proof.to_dict(), indent=2) + "\n")
+    function.unlink(missing_ok=True)  # of an earlier proof
+    lowered = [f"          W is lowered by {proof.margin:.3f}, so that it holds also on these boxes:"]
+    lowered += [f"resists   {name}, {len(boxes):,} boxes" for name, boxes in proof.resisted.items()]
+    resists = lowered if proof.resisted else []
+    if not proof.holds:
+        nothing = f"Nothing is proved: with the margin that its conditions need the bound is {proof.TRIVIAL}."
+        return [nothing, *resists, f"written   {words}"]
+    proof.save(function)
+    effort = f"boxes     {proof.boxes:,}, in {proof.seconds:.0f} s"
+    return [*lines, *resists, effort, f"written   {words}", f"written   {function}"]
+
+
+def _loaded(load: Callable[[Path], Any], path: Path) -> Any:
+    """The bound in a file; None where there is none, or where it is about other networks or another problem."""
+    try:
+        return load(path)
+    except ProofError:
+        return None
 
 
 def _settings(method: str, arguments: Sequence[str]) -> dict[str, Any]:

@@ -45,6 +45,8 @@ COPIED = (
     RunDirectory.CERTIFICATE,
     RunDirectory.PROOF,
     RunDirectory.BOUND,
+    RunDirectory.LIMIT,
+    RunDirectory.LIMIT_BOUND,
     RunDirectory.METRICS,
     RunDirectory.FIGURES,
 )

@@ -1,6 +1,8 @@
-"""The source of a subsolution: raised until L^pi W >= 0 holds at points between those of the least squares."""
+"""The source of a subsolution: raised until L^u W >= 0 holds at points between those of the least squares."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -8,17 +10,16 @@ from scipy.interpolate import BSpline
 from scipy.ndimage import maximum_filter
 
 from pirl_rl.progress import announce
+from pirl_rl.proofs.boundary import LOSS
 from pirl_rl.proofs.boxes import Boxes
 from pirl_rl.proofs.mesh import product
-from pirl_rl.proofs.points import Points, Policy
+from pirl_rl.proofs.points import Points
+from pirl_rl.proofs.rates import RatesAt
 from pirl_rl.proofs.spline import DEGREE, knots_of
 from pirl_rl.proofs.subsolution import Equation
 
-LOSS = 0.006
-"""What W loses over the horizon to the least value of L^pi W at which a fit aims, LOSS / T in 1/s."""
-
 SLACK = 0.3
-"""The share of the variation of L^pi W within a cell that its least value there is to exceed."""
+"""The share of the variation of L^u W within a cell that its least value there is to exceed."""
 
 ENOUGH = 0.75
 """A cell is left alone when it has this share of what the fit aims at."""
@@ -33,10 +34,10 @@ SHARES = (1.0, 0.3, 0.1, 0.03)
 """The source is raised by the first of these shares for which the mesh resolves W."""
 
 PLACES = (0.0, 1 / 3, 2 / 3, 1.0)
-"""Where L^pi W is evaluated in each cell along each state."""
+"""Where L^u W is evaluated in each cell along each state."""
 
 TIMES = (0.0, 0.5, 1.0)
-"""Where L^pi W is evaluated in each cell along tau."""
+"""Where L^u W is evaluated in each cell along tau."""
 
 
 class Fit:
@@ -44,42 +45,40 @@ class Fit:
 
     Args:
         equation: gives W for a source.
-        policy: the policy.
+        rates_at: the control for which L^u W >= 0 is asked.
         margin: where W is not above this, nothing is asked.
 
     Attributes:
         spline: W.
     """
 
-    def __init__(self, equation: Equation, policy: Policy, margin: float):
+    def __init__(self, equation: Equation, rates_at: RatesAt, margin: float):
         self.equation, self.mesh, self.margin = equation, equation.mesh, margin
-        self._points = Points(equation.problem, policy, self.mesh, self._checked(product(self.mesh.points(PLACES))))
+        problem = equation.ends.problem
+        self._points = Points(problem, self.mesh, self._checked(product(self.mesh.points(PLACES))))
+        self._rates = rates_at(self._points)
         self._cells = self.mesh.cell_of(self._points.x)
         self._own_cells = self.mesh.cell_of(equation.points.x)
         taus = self.mesh.taus
-        times = np.unique((taus[:-1, None] + np.diff(taus)[:, None] * np.array(TIMES)).ravel())
-        self._rates = [(tau, *self._points.rates(tau)) for tau in times]
-        self._least = LOSS / equation.problem.horizon
+        self._times = np.unique((taus[:-1, None] + np.diff(taus)[:, None] * np.array(TIMES)).ravel())
+        self._least = LOSS / problem.horizon
         self._source = np.full((len(taus), len(equation.points.x)), self._least)
         self.spline = equation.solve(self._source)
 
     def _checked(self, x: np.ndarray) -> np.ndarray:
-        """Those of states (N, n) that are outside A and B, and those of A in cells that A's face crosses.
+        """Those of states (N, n) that are outside A and B, and those inside in cells that a face crosses.
 
         The latter are left out where W is given in the same cell, since it has a kink there.
         """
-        problem, states = self.equation.problem, torch.from_numpy(x)
-        ended = problem.failed(states)
-        if problem.objective == "reach-avoid":
-            ended = ended | problem.reached(states)
-        going_on, cells = x[~ended.numpy()], self.mesh.cell_of(x)
+        interior = self.equation.ends.problem.interior(torch.from_numpy(x)).numpy()
         crossed, given = np.zeros(self.mesh.cells[1:], bool), np.zeros(self.mesh.cells[1:], bool)
-        crossed[self.mesh.cell_of(going_on)] = True
-        np.logical_or.at(given, cells, self.equation.given(x))
-        return x[~ended.numpy() | (crossed & ~given)[cells]]
+        crossed[self.mesh.cell_of(x[interior])] = True
+        cells = self.mesh.cell_of(x)
+        np.logical_or.at(given, cells, self.equation.boundary.given(x))
+        return x[interior | (crossed & ~given)[cells]]
 
     def at_points(self, rounds: int) -> None:
-        """Raise the source until L^pi W is what the fit aims at in all cells, or `rounds` times.
+        """Raise the source until L^u W is what the fit aims at in all cells, or `rounds` times.
 
         It ends where the source makes it worse, as on a mesh that is too coarse.
         """
@@ -90,13 +89,14 @@ class Fit:
                 break
 
     def on_boxes(self, boxes: Boxes, low: torch.Tensor) -> bool:
-        """Raise the source in the cells of boxes (N,) on which a lower bound (N,) of L^pi W is negative.
+        """Raise the source in the cells of boxes (N,) on which a lower bound (N,) of L^u W is negative.
 
         Returns:
             Whether the source could be raised.
         """
         missing = np.zeros(self.mesh.cells)
-        np.maximum.at(missing, tuple(boxes.cell.T.numpy()), (self._least - low).clamp(min=0).numpy())
+        cells = boxes.cell.T[: missing.ndim].numpy()
+        np.maximum.at(missing, tuple(cells), (self._least - low).clamp(min=0).numpy())
         return self.raise_in(missing)
 
     def raise_in(self, missing: np.ndarray) -> bool:
@@ -120,7 +120,7 @@ class Fit:
         return False
 
     def _missing(self) -> np.ndarray:
-        """What L^pi W lacks in each cell (cells of tau, cells of each state)."""
+        """What L^u W lacks in each cell (cells of tau, cells of each state)."""
         least, most = np.full(self.mesh.cells, np.inf), np.full(self.mesh.cells, -np.inf)
         last = self.mesh.cells[0] - 1
         for tau, residual, w in self._residuals():
@@ -135,17 +135,12 @@ class Fit:
         wanted = self._least + SLACK * np.where(asked, most - least, 0.0)
         return np.where(asked & (least < ENOUGH * wanted), wanted - least, 0.0)
 
-    def _residuals(self):
-        """tau, and L^pi W (P,) and W (P,) at the points between, for each time."""
+    def _residuals(self) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
+        """tau, and L^u W (P,) and W (P,) at the points between, for each time."""
         coefficients = self.spline.coefficients.numpy()
         curve = BSpline(knots_of(self.mesh.taus), coefficients.reshape(len(coefficients), -1), DEGREE)
         rate, points = curve.derivative(), self._points
-        for tau, f, a in self._rates:
-            c = curve(tau)
-            residual = -(points.values @ rate(tau))
-            for i, slope in enumerate(points.slopes):
-                residual += f[:, i] * (slope @ c)
-            for (i, j), curvature in points.curvatures.items():
-                if a[:, i, j].any():
-                    residual += a[:, i, j] * (0.5 if i == j else 1.0) * (curvature @ c)
-            yield tau, residual, points.values @ c
+        for tau in self._times:
+            derivatives = points.derive(curve(tau))
+            moved = np.einsum("kn,kn->n", self._rates(tau, derivatives), derivatives)
+            yield tau, moved - points.values @ rate(tau), points.values @ curve(tau)

@@ -84,6 +84,21 @@ class TaylorModel:
         reach = size - centre.abs() + self.powers[0].numel() * ROUNDING * size
         return centre - reach, centre + reach
 
+    def minus_absolute(self) -> tuple[TaylorModel, Tensor]:
+        """A lower bound of -|g| for these functions g, and whether g may change its sign (N,).
+
+        Where it does, |g| lies below its chord between both bounds of g.
+        """
+        low, high = self.bounds()
+        width = (high - low).clamp(min=torch.finfo(torch.float64).tiny)
+        slope = ((high.abs() - low.abs()) / width).clamp(-1, 1)
+        # |g| is convex, so that a line above it at both bounds is above it between them.
+        offset = torch.maximum(low.abs() - slope * low, high.abs() - slope * high).clamp(min=0)
+        rounding = 8 * ROUNDING * (self.size + low.abs() + high.abs())
+        powers = -self.powers * _column(slope, self.powers)
+        powers.flatten(1)[:, 0] -= offset
+        return TaylorModel(powers, self.remainder * slope.abs() + rounding), (low < 0) & (high > 0)
+
     def variation(self) -> Tensor:
         """A measure (d, N) of how much the polynomial changes along each coordinate."""
         size, rows = self.powers.abs(), []

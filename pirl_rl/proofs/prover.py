@@ -1,4 +1,4 @@
-"""The proof of a lower bound: fit W, bound its conditions on boxes, and take from W what they lack."""
+"""The proof of a bound: fit W, bound its conditions on boxes, and take from W what they lack."""
 
 from __future__ import annotations
 
@@ -8,19 +8,24 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from pirl_rl.arguments import check_integer
 from pirl_rl.errors import ProofError
+from pirl_rl.grid import GridSolver
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.progress import announce
 from pirl_rl.proofs.affine import Affine
 from pirl_rl.proofs.boxes import Boxes
-from pirl_rl.proofs.conditions import Conditions
+from pirl_rl.proofs.conditions import Conditions, Feedback
+from pirl_rl.proofs.ends import Absorbing, Ends
 from pirl_rl.proofs.fit import Fit
-from pirl_rl.proofs.mesh import Mesh, mesh_of
-from pirl_rl.proofs.proof import Proof
+from pirl_rl.proofs.mesh import mesh_of
+from pirl_rl.proofs.points import Points
+from pirl_rl.proofs.proof import LowerBound, UpperBound
+from pirl_rl.proofs.rates import LeastRates, Policy, PolicyRates, RatesAt
 from pirl_rl.proofs.search import Check, Outcome, prove
 from pirl_rl.proofs.subsolution import Equation
 from pirl_rl.solution import Solution
@@ -59,8 +64,27 @@ class Settings:
             check_integer(name, getattr(self, name), least)
 
 
-def prove_success(solution: Solution, networks: str, settings: Settings | None = None) -> Proof:
-    """Fit W to the policy of a solution, and prove W - margin a lower bound of its probability of success.
+@dataclass(frozen=True)
+class Claim:
+    """What a proof is about.
+
+    Attributes:
+        ends: the problem, and what W may be where paths end.
+        policy: the policy under which W is fitted.
+        rates_at: the controls for which the fit asks L^u W >= 0.
+        feedback: the controls for which this is proved.
+        controls: the ends (2,) of the ranges of controls that are coordinates of the boxes.
+    """
+
+    ends: Ends
+    policy: Policy
+    rates_at: RatesAt
+    feedback: Feedback
+    controls: list[np.ndarray]
+
+
+def prove_success(solution: Solution, networks: str, settings: Settings | None = None) -> LowerBound:
+    """Prove a lower bound of the probability of success of a solution's policy.
 
     Args:
         solution: the problem and the policy; the networks are taken to be exact functions of real numbers.
@@ -70,85 +94,127 @@ def prove_success(solution: Solution, networks: str, settings: Settings | None =
     Raises:
         ProofError: there are no networks, too many states or periodic ones, or a function has no enclosure.
     """
-    problem, settings = solution.problem, settings or Settings()
     if not hasattr(solution, "actor"):
         raise ProofError("proof: expected a policy that is a network, got that of a grid")
+    _check(solution.problem)
+    policy = _policy(solution)
+
+    def feedback(z: Any) -> Any:
+        return policy(z[:, 0], z[:, 1:])
+
+    def rates_at(points: Points) -> PolicyRates:
+        return PolicyRates(points, policy)
+
+    claim = Claim(Ends(solution.problem, True), policy, rates_at, feedback, [])
+    return LowerBound(networks=networks, **_prove(claim, settings))
+
+
+def prove_limit(problem: ReachAvoidProblem, settings: Settings | None = None) -> UpperBound:
+    """Prove an upper bound of the probability of success of every policy, which is one of V.
+
+    Args:
+        problem: the physics.
+        settings: the effort.
+
+    Raises:
+        ProofError: there are too many states or periodic ones, or a function has no enclosure.
+    """
+    box = problem.controls
+
+    def feedback(z: Affine) -> Affine:
+        return z[:, 1 + problem.states.dim :]
+
+    def policy(tau: Tensor, x: Tensor) -> Tensor:
+        return solution.policy(tau, x)
+
+    _check(problem)
+    announce("solving on a grid")
+    # W is fitted to a policy that is nearly the best. The proof does not depend on it.
+    solution = GridSolver(problem, estimate=False).solve()
+    controls = [np.array(ends) for ends in zip(box.low, box.high, strict=True)]
+    return UpperBound(**_prove(Claim(Ends(problem, False), policy, LeastRates, feedback, controls), settings))
+
+
+def _check(problem: ReachAvoidProblem) -> None:
     if problem.states.dim > MOST_STATES:
         raise ProofError(f"proof: expected at most {MOST_STATES} states, got {problem.states.dim}")
     if problem.states.periodic:
         raise ProofError("proof: expected no periodic coordinates")
-    started, policy = time.perf_counter(), _feedback(solution)
+
+
+def _prove(claim: Claim, settings: Settings | None) -> dict[str, Any]:
+    """The fields of a proof."""
+    settings, started = settings or Settings(), time.perf_counter()
     announce("fitting a bound")
-    mesh = mesh_of(problem, settings.cells, settings.steps)
-    fit = Fit(Equation(problem, policy, mesh), policy, MARGIN)
+    mesh = mesh_of(claim.ends, settings.cells, settings.steps)
+    cells = Boxes.cells([*mesh.edges, *claim.controls])
+    fit = Fit(Equation(claim.ends, claim.policy, mesh), claim.rates_at, MARGIN)
     fit.at_points(settings.rounds)
-    outcomes = {"interior": _fit_on_boxes(fit, problem, policy, settings)}
-    for name, check, boxes in _boundary(Conditions(problem, policy, fit.spline, MARGIN), mesh):
+
+    def conditions() -> Conditions:
+        return Conditions(claim.ends, claim.feedback, fit.spline, MARGIN)
+
+    outcomes = {"interior": _fit_on_boxes(fit, conditions, cells, settings)}
+    for name, check, boxes in _boundary(conditions(), cells):
         outcomes[name] = prove(check, boxes, MARGIN, settings.halvings)
-    return Proof(
-        spline=fit.spline,
+    return {
+        "problem": claim.ends.problem,
+        "spline": fit.spline,
         # W is not above its largest coefficient.
-        margin=min(max(outcome.margin for outcome in outcomes.values()), fit.spline.coefficients.max().item()),
-        resisted={name: outcome.left for name, outcome in outcomes.items() if not outcome.proved},
-        boxes=sum(outcome.bounded for outcome in outcomes.values()),
-        networks=networks,
-        seconds=time.perf_counter() - started,
-    )
+        "margin": min(max(outcome.margin for outcome in outcomes.values()), fit.spline.coefficients.max().item()),
+        "resisted": {name: outcome.left for name, outcome in outcomes.items() if not outcome.proved},
+        "boxes": sum(outcome.bounded for outcome in outcomes.values()),
+        "seconds": time.perf_counter() - started,
+    }
 
 
-def _fit_on_boxes(fit: Fit, problem: ReachAvoidProblem, policy: Any, settings: Settings) -> Outcome:
-    """Raise the source where L^pi W >= 0 is not proved, until it is; the boxes that are left are those of all cells."""
-    cells = everywhere = Boxes.cells(fit.mesh.edges)
+def _fit_on_boxes(fit: Fit, conditions: Callable[[], Conditions], everywhere: Boxes, settings: Settings) -> Outcome:
+    """Raise the source where L^u W >= 0 is not proved, until it is; the boxes that are left are those of all cells."""
+    cells = everywhere
     for number in range(1, settings.rounds + 1):
         announce(f"proving the bound, round {number}")
-        conditions = Conditions(problem, policy, fit.spline, MARGIN)
-        outcome = prove(conditions.interior, cells, MARGIN, settings.halvings)
+        present = conditions()
+        outcome = prove(present.interior, cells, MARGIN, settings.halvings)
         if outcome.proved and cells is everywhere:
             return outcome
         if outcome.proved:
             cells = everywhere
             continue
-        if not fit.on_boxes(outcome.left, conditions.residual(outcome.left)):
+        if not fit.on_boxes(outcome.left, present.residual(outcome.left)):
             break
         # The source changes W little elsewhere. All cells are proved again in the end.
         cells = everywhere.around(outcome.left)
-    return prove(Conditions(problem, policy, fit.spline, MARGIN).interior, everywhere, MARGIN, settings.halvings)
+    return prove(conditions().interior, everywhere, MARGIN, settings.halvings)
 
 
-def _feedback(solution: Solution) -> Callable[[Any, Any], Any]:
+def _policy(solution: Solution) -> Policy:
     """The policy in double precision, of tensors or of affine forms tau (N,) and x (N, n)."""
     actor, controls = copy.deepcopy(solution.actor).cpu().double(), solution.problem.controls
 
     @torch.no_grad()
-    def policy(tau: Tensor | Affine, x: Tensor | Affine):
+    def policy(tau: Any, x: Any) -> Any:
         return controls.denormalize(actor(tau.unsqueeze(-1), x))
 
     return policy
 
 
-def _boundary(conditions: Conditions, mesh: Mesh) -> list[Condition]:
+def _boundary(conditions: Conditions, cells: Boxes) -> list[Condition]:
     """The conditions at tau = 0, on the sides of the mesh, and on the faces of A and B."""
-    cells, problem = Boxes.cells(mesh.edges), conditions.problem
     found: list[Condition] = [("tau = 0", conditions.start, cells.at_end(0, 0, -1))]
-    for axis, last in enumerate(mesh.cells[1:]):
-        for outward, cell in ((-1, 0), (1, last - 1)):
+    problem = conditions.ends.problem
+    for axis in range(problem.states.dim):
+        for outward, cell in ((-1, 0), (1, len(cells.edges[1 + axis]) - 2)):
 
             def side(boxes: Boxes, axis: int = axis, outward: int = outward) -> tuple[Tensor, Tensor]:
                 return conditions.side(boxes, axis, outward)
 
             name = f"the {'lower' if outward < 0 else 'upper'} side of coordinate {axis + 1}"
             found.append((name, side, cells.at_end(1 + axis, cell, outward)))
-    for name, constraints, most in _sets(problem):
-        for number in range(constraints(torch.zeros(1, problem.states.dim, dtype=torch.float64)).shape[-1]):
+    for absorbing in conditions.ends.sets():
+        for number in range(absorbing.levels(torch.zeros(1, problem.states.dim, dtype=torch.float64)).shape[-1]):
 
-            def face(boxes: Boxes, constraints=constraints, number: int = number, most: float = most):
-                return conditions.face(boxes, constraints, number, most)
+            def face(boxes: Boxes, absorbing: Absorbing = absorbing, number: int = number) -> tuple[Tensor, Tensor]:
+                return conditions.face(boxes, absorbing, number)
 
-            found.append((f"face {number + 1} of {name}", face, cells))
+            found.append((f"face {number + 1} of {absorbing.name}", face, cells))
     return found
-
-
-def _sets(problem: ReachAvoidProblem) -> list[tuple[str, Callable, float]]:
-    """The sets at which paths end, with their constraints and their payoff."""
-    sets = [("A", problem.reached_constraints, 1.0)] if problem.objective == "reach-avoid" else []
-    return sets + ([("B", problem.avoid_constraints, 0.0)] if problem.has_avoid_set else [])

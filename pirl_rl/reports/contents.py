@@ -15,12 +15,12 @@ from omegaconf import DictConfig, OmegaConf
 
 from pirl_rl.assembly import make_evaluation_simulator
 from pirl_rl.checkpoint import digest
-from pirl_rl.errors import RunError
+from pirl_rl.errors import ProofError, RunError
 from pirl_rl.evaluation.planes import planes_of
 from pirl_rl.loggers import read_metrics
 from pirl_rl.machine import read_sessions
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.proofs import Proof
+from pirl_rl.proofs import LowerBound, UpperBound
 from pirl_rl.reports.curves import training_curves
 from pirl_rl.reports.line import line_maps
 from pirl_rl.reports.maps import plane_maps, shown_controls
@@ -32,7 +32,13 @@ from pirl_rl.run_directory import RunDirectory
 from pirl_rl.runs.load import load_run
 from pirl_rl.runs.run import Run
 
-JSON = (RunDirectory.SUMMARY, RunDirectory.EVALUATION, RunDirectory.CERTIFICATE, RunDirectory.PROOF)
+JSON = (
+    RunDirectory.SUMMARY,
+    RunDirectory.EVALUATION,
+    RunDirectory.CERTIFICATE,
+    RunDirectory.PROOF,
+    RunDirectory.LIMIT,
+)
 """The files whose numbers a report shows."""
 
 
@@ -63,6 +69,7 @@ class Contents:
         figures: the figures as addresses, with their sizes.
         left_out: names of figures that did not fit.
         networks: the SHA-256 of the policy and V.
+        limited: whether what was proved about all policies is about this problem.
         sessions: how the run was made, see `pirl_rl.machine`.
         overrides: the overrides of its command line; empty where they are not known.
     """
@@ -76,6 +83,7 @@ class Contents:
     figures: dict[str, dict[str, Any]]
     left_out: list[str]
     networks: str
+    limited: bool
     sessions: list[dict[str, Any]]
     overrides: list[str]
 
@@ -107,6 +115,7 @@ class Contents:
             figures=figures,
             left_out=[path.stem for path in drawn if path.stem not in figures],
             networks=networks,
+            limited=_limit(directory, run.problem) is not None,
             sessions=read_sessions(directory),
             overrides=_overrides(directory),
         )
@@ -175,9 +184,22 @@ def _data(run: Run, directory: RunDirectory, networks: str, budget: Budget) -> d
     }
     if run.problem.states.dim > 1:
         return found | {"planes": plane_maps(solution, planes_of(solution), budget.maps)}
-    # A proof that was made for other networks is shown in words alone, which say so.
-    proved = directory.bound.is_file() and read_json(directory.proof).get("networks") == networks
-    return found | {"line": line_maps(solution, Proof.load(directory.bound, networks).bound if proved else None)}
+    # A proof that was made for other networks or another problem is shown in words alone, which say so.
+    bounds: dict[str, Any] = {}
+    if directory.bound.is_file() and read_json(directory.proof).get("networks") == networks:
+        bounds["lower"] = LowerBound.load(directory.bound, run.problem, networks).bound
+    limit = _limit(directory, run.problem)
+    if limit is not None:
+        bounds["upper"] = limit.bound
+    return found | {"line": line_maps(solution, bounds)}
+
+
+def _limit(directory: RunDirectory, problem: ReachAvoidProblem) -> UpperBound | None:
+    """What was proved about all policies; None without a proof, or where it is about another problem."""
+    try:
+        return UpperBound.load(directory.limit_bound, problem)
+    except ProofError:
+        return None
 
 
 def _metrics(directory: RunDirectory) -> dict[str, np.ndarray]:

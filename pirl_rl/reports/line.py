@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -20,8 +20,10 @@ LARGEST = 65_535
 """The code of the largest number, so that curves have no visible steps."""
 
 
-def line_maps(solution: Solution, bound: Callable[[np.ndarray, np.ndarray], np.ndarray] | None) -> dict[str, Any]:
-    """V, the exact V where it is known, a proved bound if there is one, and the control of a problem with one state."""
+def line_maps(
+    solution: Solution, bounds: Mapping[str, Callable[[np.ndarray, np.ndarray], np.ndarray]]
+) -> dict[str, Any]:
+    """V, the exact V where it is known, proved bounds by name, and the control of a problem with one state."""
     problem = solution.problem
     tau = torch.linspace(0, problem.horizon, TAUS, dtype=torch.float64)
     x = torch.linspace(problem.states.low[0], problem.states.high[0], POINTS, dtype=torch.float64)
@@ -30,9 +32,9 @@ def line_maps(solution: Solution, bound: Callable[[np.ndarray, np.ndarray], np.n
     exact = problem.exact_value(*pairs)
     if exact is not None:
         curves["exact"] = exact.numpy()
-    if bound is not None:
-        low = bound(*(entry.numpy() for entry in pairs))
-        curves["bound"] = np.where(problem.interior(pairs[1]).numpy(), low, curves["value"])
+    interior = problem.interior(pairs[1]).numpy()
+    for name, bound in bounds.items():
+        curves[name] = np.where(interior, bound(*(entry.numpy() for entry in pairs)), curves["value"])
     control, box = evaluated(solution, solution.policy, *pairs), problem.controls
     return {
         "label": as_html(state_names(problem)[0]),

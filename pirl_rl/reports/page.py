@@ -119,7 +119,8 @@ def render(runs: Sequence[Contents], trust: Sequence[str] = ()) -> str:
             hashes=[_hash(script), _hash(library)],
         )
     except UndefinedError as error:
-        names = " or ".join(str(name) for name in (RunDirectory.CERTIFICATE, RunDirectory.PROOF))
+        files = (RunDirectory.CERTIFICATE, RunDirectory.PROOF, RunDirectory.LIMIT)
+        names = " or ".join(str(name) for name in files)
         raise RunError(f"report: expected all entries of {names}, got one without: {error}") from error
 
 

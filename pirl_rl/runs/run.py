@@ -21,7 +21,7 @@ from pirl_rl.evaluation.monte_carlo import Estimate, monte_carlo
 from pirl_rl.evaluation.trajectories import Trajectories, closed_loop
 from pirl_rl.grid import GridSolution
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.proofs import Proof, Settings, prove_success
+from pirl_rl.proofs import LowerBound, Settings, UpperBound, prove_limit, prove_success
 from pirl_rl.sampling.initial_states import InitialStates
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
@@ -210,7 +210,7 @@ class Run:
         certifiers = make_certifiers(names, episodes, at_least, states, rollouts, share, success)
         return certify(self.solution, simulator, where, certifiers, confidence, picked_from, seed, corollary)
 
-    def prove(self, cells: int = 64, steps: int = 60, rounds: int = 40, halvings: int = 10) -> Proof:
+    def prove(self, cells: int = 64, steps: int = 60, rounds: int = 40, halvings: int = 10) -> LowerBound:
         """Prove a lower bound of the policy's probability of success under continuous feedback, see `pirl_rl.proofs`.
 
         Args:
@@ -224,13 +224,28 @@ class Run:
         """
         return prove_success(self.solution, self._digest(), Settings(cells, steps, rounds, halvings))
 
-    def load_proof(self, path: str | Path) -> Proof:
+    def prove_limit(self, cells: int = 64, steps: int = 60, rounds: int = 40, halvings: int = 10) -> UpperBound:
+        """Prove an upper bound of the probability of success of every policy, which does not depend on the networks.
+
+        The arguments and the errors are those of `prove`.
+        """
+        return prove_limit(self.problem, Settings(cells, steps, rounds, halvings))
+
+    def load_proof(self, path: str | Path) -> LowerBound:
         """The bound that `certify method=interval` wrote to a file `proof.npz`.
 
         Raises:
             ProofError: the file cannot be read, or it is about other networks than those of this run.
         """
-        return Proof.load(path, self._digest())
+        return LowerBound.load(path, self.problem, self._digest())
+
+    def load_limit(self, path: str | Path) -> UpperBound:
+        """The bound that `certify method=interval bounds=[upper]` wrote to a file `limit.npz`.
+
+        Raises:
+            ProofError: the file cannot be read, or it is about another problem than that of this run.
+        """
+        return UpperBound.load(path, self.problem)
 
     def _digest(self) -> str:
         return Deployed(self.solution, self.simulator).digest()
