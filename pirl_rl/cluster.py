@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import logging
 import os
@@ -60,8 +61,7 @@ def connected(address: str | None, cpus: int | None = None, show_output: bool = 
     check_address(address)
     require_ray("address")
     os.environ.setdefault("RAY_DEDUP_LOGS", "0")  # otherwise equal lines of two runs are printed once
-    import ray
-
+    ray: Any = importlib.import_module("ray")
     if ray.is_initialized():
         yield ray
         return

@@ -91,6 +91,31 @@ def test_addresses_have_a_host_and_a_port(address):
         cluster.check_address(address)
 
 
+class Silent:
+    """In place of Ray: no worker ever delivers."""
+
+    def wait(self, batches: list, **options: object) -> tuple[list, list]:
+        return [], batches
+
+    def available_resources(self) -> dict[str, float]:
+        return {"CPU": 3.0}
+
+
+def test_silent_workers_are_noticed_and_a_sleep_of_the_machine_is_no_silence(tmp_path, monkeypatch):
+    monkeypatch.setattr("pirl_rl.collectors.ray.require_ray", lambda key: None)
+    settings = ("collector=ray", "collector.patience=60", "collector.updates_per_batch=1000")
+    collector = small_trainer(tmp_path, *settings, base=(*QUICK, *SMALL)).collector
+    collector._ray, collector.warmup_frames, now = Silent(), 0, [0.0]
+    monkeypatch.setattr("pirl_rl.collectors.ray.time.monotonic", lambda: now[0])
+    for pause in (1.0, 3_600.0, 50.0, 50.0):
+        now[0] += pause
+        collector.step(1)
+    with pytest.raises(CollectorError, match=r"2 rollout workers delivered nothing for 60 s; .* has 3 left"):  # noqa: PT012
+        for _ in range(45):
+            now[0] += 1.0
+            collector.step(1)
+
+
 # Two nodes
 
 

@@ -29,6 +29,10 @@ MOST_DEATHS = 3
 POLL = 0.02
 """Seconds between two looks at the workers while the learner waits for the warm-up."""
 
+LONGEST_GAP = 5.0
+"""The most seconds between two looks that count as silence of the workers. In a longer gap the learner was busy, as
+with an evaluation, or its machine slept, and it could not hear the workers."""
+
 
 class RayCollector:
     """Worker processes on a Ray cluster play while the learner learns; the buffer stays in the learner's process.
@@ -47,7 +51,7 @@ class RayCollector:
         updates_per_batch: updates between two times that the networks are sent to the workers.
         warmup_frames, buffer_size, exploration_noise, exploration, n_steps, control_variate, initial_states, seed:
             arguments of `SyncCollector`.
-        patience: seconds without a batch and without a death after which `CollectorError` is raised.
+        patience: seconds of silence, without a batch and without a death, after which `CollectorError` is raised.
 
     Raises:
         ArgumentError: a number is out of range, or `exploration` is unknown.
@@ -91,7 +95,7 @@ class RayCollector:
         self._processes: list[Any] = []
         self._playing: dict[Any, int] = {}  # the batches that are being played, with the index of the worker
         self._weights: Any = None
-        self._deaths, self._heard_at = 0, 0.0
+        self._deaths, self._silence, self._looked_at = 0, 0.0, 0.0
 
     @property
     def initial_states(self) -> InitialStates:
@@ -127,7 +131,7 @@ class RayCollector:
     def start(self) -> None:
         self._ray = self._held.enter_context(connected(self._address, self._workers))
         self._publish()
-        self._heard_at = time.monotonic()
+        self._silence, self._looked_at = 0.0, time.monotonic()
         self._processes = [self._new_process(index) for index in range(self._workers)]
         for index in range(self._workers):
             self._send(index)
@@ -203,9 +207,11 @@ class RayCollector:
             else:
                 self.buffer.extend(transitions.to(self._rng.device))
                 self._deaths = 0
-            self._heard_at = time.monotonic()
             self._send(index)
-        if time.monotonic() - self._heard_at > self.patience:
+        now = time.monotonic()
+        self._silence = 0.0 if done else self._silence + min(now - self._looked_at, LONGEST_GAP)
+        self._looked_at = now
+        if self._silence > self.patience:
             free = self._ray.available_resources().get("CPU", 0)
             raise CollectorError(
                 f"{self._workers} rollout workers delivered nothing for {self.patience:.0f} s; each needs a processor "
