@@ -11,11 +11,13 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy import stats
 from small import QUICK, at_each_update, at_update, command, small_trainer, wait_for
+from tensordict import TensorDict
 
 from pirl_rl import cluster, train
 from pirl_rl.errors import ArgumentError, ClusterError, CollectorError
@@ -24,11 +26,11 @@ from pirl_rl.run_directory import RunDirectory
 
 SMALL = ("env.num_envs=32", "collector.frames_per_batch=64", "collector.warmup_frames=64")
 
-# A training of a few seconds that learns V on reach1d, with every worker's batch a twentieth of a run.
+# A training of a few seconds that learns V on reach1d, in which the sync collector plays twenty batches.
 LEARNING = (
     *("+experiment=reach1d", "compile=false", "env.dt=0.05", "env.substeps=1", "env.num_envs=512", "logger=none"),
     *("collector.frames_per_batch=10240", "collector.warmup_frames=10240", "collector.buffer_size=20480"),
-    *("trainer.updates=500", "trainer.batch_size=256", "trainer.evaluate_every=0", "trainer.checkpoint_every=0"),
+    *("trainer.updates=1000", "trainer.batch_size=256", "trainer.evaluate_every=0", "trainer.checkpoint_every=0"),
     *("evaluation.during=[]", "evaluation.final=[exact]"),
 )
 
@@ -101,11 +103,48 @@ class Silent:
         return {"CPU": 3.0}
 
 
+class Slow(Silent):
+    """In place of Ray: every batch comes when it was asked for 30 times."""
+
+    def __init__(self):
+        self.asked, self.puts = 0, 0
+
+    def put(self, weights: object) -> None:
+        self.puts += 1
+
+    def wait(self, batches: list, **options: object) -> tuple[list, list]:
+        self.asked += 1
+        return (batches, []) if self.asked % 30 == 0 else ([], batches)
+
+    def get(self, batch: object) -> TensorDict:
+        return TensorDict(batch_size=[0])
+
+
+def test_the_learner_does_not_run_ahead_of_slow_workers(tmp_path, monkeypatch):
+    """Before each third update but the first two it waits for a batch with the networks of the time before."""
+    monkeypatch.setattr("pirl_rl.collectors.ray.require_ray", lambda key: None)
+    monkeypatch.setattr("pirl_rl.collectors.ray.POLL", 0.0)
+    settings = ("collector=ray", "collector.workers=1", "collector.updates_per_batch=3")
+    collector = small_trainer(tmp_path, *settings, base=(*QUICK, *SMALL)).collector
+    collector.buffer.extend = lambda batch: None
+    ray = collector._ray = Slow()
+    collector.warmup_frames, plays = 0, iter(range(10_000))
+    play = SimpleNamespace(remote=lambda weights: next(plays))
+    collector._processes = [SimpleNamespace(play=play)]
+    collector._publish()
+    collector._send(0)
+    for update in range(30):
+        collector.step(update)
+        assert ray.puts == 2 + update // 3
+        assert collector._newest >= ray.puts - 1
+    assert ray.asked > 9 * 30
+
+
 def test_silent_workers_are_noticed_and_a_sleep_of_the_machine_is_no_silence(tmp_path, monkeypatch):
     monkeypatch.setattr("pirl_rl.collectors.ray.require_ray", lambda key: None)
     settings = ("collector=ray", "collector.patience=60", "collector.updates_per_batch=1000")
     collector = small_trainer(tmp_path, *settings, base=(*QUICK, *SMALL)).collector
-    collector._ray, collector.warmup_frames, now = Silent(), 0, [0.0]
+    collector._ray, collector.warmup_frames, collector._sent, now = Silent(), 0, 1, [0.0]
     monkeypatch.setattr("pirl_rl.collectors.ray.time.monotonic", lambda: now[0])
     for pause in (1.0, 3_600.0, 50.0, 50.0):
         now[0] += pause
@@ -173,6 +212,7 @@ def test_a_training_survives_the_death_of_a_worker(two_nodes, tmp_path):
     trainer = small_trainer(tmp_path, "collector=ray", "collector.workers=4", address, "seed=0", base=LEARNING)
     collector, before, counts, received = trainer.collector, [], [], []
     at_each_update(trainer, lambda k: counts.append((len(collector.buffer), collector.buffer.write_count)))
+
     send = collector._send
 
     def noted_send(index: int) -> None:
@@ -191,11 +231,11 @@ def test_a_training_survives_the_death_of_a_worker(two_nodes, tmp_path):
         assert [after[0], *after[2:]] == [before[0], *before[2:]]
 
     collector._send = noted_send
-    at_update(trainer, 150, kill)
-    at_update(trainer, 300, wait_for_all)
+    at_update(trainer, 300, kill)
+    at_update(trainer, 600, wait_for_all)
     summary = trainer.train()
     assert before
-    assert summary["updates"] == 500
+    assert summary["updates"] == 1000
     # The buffer keeps what it has, and takes whole batches alone.
     sizes, written = np.array(counts).T
     assert (np.diff(sizes) >= 0).all()

@@ -37,9 +37,12 @@ with an evaluation, or its machine slept, and it could not hear the workers."""
 class RayCollector:
     """Worker processes on a Ray cluster play while the learner learns; the buffer stays in the learner's process.
 
-    Each worker plays one batch at a time, with the networks that were the newest when it began. A worker that dies, or
-    whose machine is lost, is replaced by a new one with other random numbers, and only its current batch is lost. (Ray
-    could restart it by itself, but would repeat the random numbers of the first one.)
+    Each worker plays one batch at a time, with the networks that were the newest when it began. The learner does not
+    run ahead of slow workers: every `updates_per_batch` updates it sends its networks, and waits, if it must, until a
+    batch has come that was played with those of the time before, or with newer ones.
+
+    A worker that dies, or whose machine is lost, is replaced by a new one with other random numbers, and only its
+    current batch is lost. (Ray could restart it by itself, but would repeat the random numbers of the first one.)
 
     Args:
         env: the environment; each worker builds a copy with its own seed on the CPU.
@@ -48,7 +51,7 @@ class RayCollector:
         address: the address of a running cluster, such as "10.0.0.1:6379", or "auto" for that to which this machine
             belongs; None starts a Ray of its own on this machine.
         frames_per_batch: transitions that a worker delivers at once, a multiple of the environment's batch size.
-        updates_per_batch: updates between two times that the networks are sent to the workers.
+        updates_per_batch: updates between two times that the networks are sent, see above.
         warmup_frames, buffer_size, exploration_noise, exploration, n_steps, control_variate, initial_states, seed:
             arguments of `SyncCollector`.
         patience: seconds of silence, without a batch and without a death, after which `CollectorError` is raised.
@@ -93,8 +96,10 @@ class RayCollector:
         self._held = ExitStack()
         self._ray: Any = None
         self._processes: list[Any] = []
-        self._playing: dict[Any, int] = {}  # the batches that are being played, with the index of the worker
+        # The batches that are being played, with the index of the worker and the number of its networks.
+        self._playing: dict[Any, tuple[int, int]] = {}
         self._weights: Any = None
+        self._sent, self._newest = 0, 0  # the numbers of the networks that were sent last, and played last
         self._deaths, self._silence, self._looked_at = 0, 0.0, 0.0
 
     @property
@@ -141,6 +146,9 @@ class RayCollector:
         if update % self.updates_per_batch == 0:
             self._publish()
         self._receive()
+        while self._newest < self._sent - 1:
+            time.sleep(POLL)
+            self._receive()
         self._fill()  # a stage may have emptied the buffer
 
     def close(self) -> None:
@@ -161,12 +169,14 @@ class RayCollector:
         """Put the newest networks where the workers find them."""
         weights = {name: entry.detach().cpu() for name, entry in self._policy.state_dict().items()}
         self._weights = self._ray.put(weights)
+        self._sent += 1
 
     def _new_process(self, index: int) -> Any:
         # The seeds depend on the count of transitions, so that no process repeats the noise of one before it.
         words = np.random.SeedSequence([self._seed, self.buffer.write_count, self._deaths, index]).generate_state(2)
         physics, policy = (int(word) for word in words)
         missing = max(0, self.warmup_frames - self.buffer.write_count) * self._random_warmup
+        batches = -(-missing // self._frames_per_batch)  # the first workers play those that cannot be shared evenly
         return (
             self._ray.remote(Worker)
             .options(num_cpus=1)
@@ -174,14 +184,14 @@ class RayCollector:
                 self._env.recipe(physics),
                 copy.deepcopy(self._policy).cpu(),
                 self._frames_per_batch,
-                -(-missing // self._workers),
+                (batches + self._workers - 1 - index) // self._workers * self._frames_per_batch,
                 self._n_steps,
                 policy,
             )
         )
 
     def _send(self, index: int) -> None:
-        self._playing[self._processes[index].play.remote(self._weights)] = index
+        self._playing[self._processes[index].play.remote(self._weights)] = index, self._sent
 
     def _fill(self) -> None:
         while len(self.buffer) < min(self.warmup_frames, self.buffer.storage.max_size):
@@ -197,7 +207,7 @@ class RayCollector:
         """
         done, _ = self._ray.wait(list(self._playing), num_returns=self._workers, timeout=0)
         for batch in done:
-            index = self._playing.pop(batch)
+            index, networks = self._playing.pop(batch)
             try:
                 transitions: TensorDictBase = self._ray.get(batch)
             except self._ray.exceptions.RayTaskError as error:
@@ -206,7 +216,7 @@ class RayCollector:
                 self._replace(index, reason_of(error))
             else:
                 self.buffer.extend(transitions.to(self._rng.device))
-                self._deaths = 0
+                self._deaths, self._newest = 0, max(self._newest, networks)
             self._send(index)
         now = time.monotonic()
         self._silence = 0.0 if done else self._silence + min(now - self._looked_at, LONGEST_GAP)
