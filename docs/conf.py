@@ -143,6 +143,8 @@ reference_rooms = {
             "pirl_rl.collectors",
             "pirl_rl.collectors.sync",
             "pirl_rl.collectors.multi_async",
+            "pirl_rl.collectors.ray",
+            "pirl_rl.collectors.player",
             "pirl_rl.collectors.transitions",
             "pirl_rl.collectors.buffers",
         ],

@@ -30,6 +30,10 @@ class CollectorError(PirlError, RuntimeError):
     """A rollout worker did not start, died or delivered nothing; the message says which."""
 
 
+class ClusterError(PirlError, RuntimeError):
+    """Ray is not installed, or its cluster cannot be reached; the message names the setting or the address."""
+
+
 class DivergenceError(PirlError, RuntimeError):
     """A loss or a parameter became NaN or infinite, or a loss exploded; the message names the update and the term."""
 

@@ -17,6 +17,7 @@ from small import QUICK, command
 from pirl_rl import load_run, train
 from pirl_rl.commands import catalogue
 from pirl_rl.configuration import CONF, load_config
+from pirl_rl.machine import read_sessions
 from pirl_rl.run_directory import RunDirectory
 
 OWN = """
@@ -246,6 +247,25 @@ def test_sweep_goes_on_after_a_bad_job(cli, tmp_path):
     assert "seed: expected int, got 'x'" in text
     assert "Traceback" not in text
     assert sorted(path.name for path in tmp_path.glob("runs/*/*/*-*")) == ["0-pirl-0", "2-pirl-2"]
+
+
+def test_a_sweep_that_is_started_again_repeats_nothing(cli, tmp_path):
+    """At the second start, the first run is finished and the second was begun."""
+    sweep = ("-m", *QUICK, *SMALL, "hydra.sweep.dir=sweep", "evaluation.during=[]")
+    assert cli(*sweep, "seed=0,1")[0] == 0
+    finished, begun = (RunDirectory(tmp_path / "sweep" / f"{seed}-pirl-{seed}") for seed in range(2))
+    begun.summary.unlink()
+    before = {path: path.stat().st_mtime_ns for path in finished.path.rglob("*")}
+    code, text = cli(*sweep, "seed=0,1")
+    assert code == 0, text
+    assert text.count("is finished already") == 1
+    assert {path: path.stat().st_mtime_ns for path in finished.path.rglob("*")} == before
+    assert begun.numbers()["updates"] == finished.numbers()["updates"]
+    assert [len(read_sessions(run)) for run in (finished, begun)] == [1, 2]
+    code, text = cli(*sweep, "method=pirl", "seed=0,1")
+    assert code == 1
+    assert "expected a new directory or that of the same sweep" in text
+    assert {path: path.stat().st_mtime_ns for path in finished.path.rglob("*")} == before
 
 
 def test_bad_sweep_leaves_nothing(tmp_path):

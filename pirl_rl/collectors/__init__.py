@@ -5,6 +5,7 @@
 - `MultiAsyncCollector`: worker processes fill a shared buffer while the learner learns, as in Algorithm 1 of the paper.
   A resumed run equals an uninterrupted one in distribution only: the buffer is restored, but the workers start new
   episodes.
+- `RayCollector`: the same with worker processes on the machines of a Ray cluster. A worker that dies is replaced.
 """
 
 from __future__ import annotations
@@ -15,12 +16,20 @@ from typing import Any, Protocol
 from torchrl.data import TensorDictReplayBuffer
 
 from pirl_rl.collectors.multi_async import MultiAsyncCollector
+from pirl_rl.collectors.ray import RayCollector
 from pirl_rl.collectors.sync import SyncCollector
 from pirl_rl.collectors.transitions import ControlVariate
 from pirl_rl.errors import CollectorError
 from pirl_rl.sampling.initial_states import InitialStates
 
-__all__ = ["CollectorError", "ControlVariate", "MultiAsyncCollector", "SyncCollector", "TransitionCollector"]
+__all__ = [
+    "CollectorError",
+    "ControlVariate",
+    "MultiAsyncCollector",
+    "RayCollector",
+    "SyncCollector",
+    "TransitionCollector",
+]
 
 logging.getLogger("torchrl").setLevel(logging.WARNING)
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any, Literal
 
 from tensordict import TensorDict
-from torchrl.collectors import Collector
 
 from pirl_rl.checkpoint import restore_rng
 from pirl_rl.collectors.buffers import buffer_state, check_sizes, fill_buffer, load_buffer, make_buffer
-from pirl_rl.collectors.transitions import ControlVariate, Exploration, PlayedPolicy, Transitions
+from pirl_rl.collectors.player import Player
+from pirl_rl.collectors.transitions import ControlVariate, Exploration, PlayedPolicy
 from pirl_rl.envs import ReachAvoidEnv
 from pirl_rl.internals import carried
 from pirl_rl.networks import Actor
@@ -58,18 +58,8 @@ class SyncCollector:
         self.env, self.updates_per_batch, self.warmup_frames = env, updates_per_batch, warmup_frames
         env.initial_states = initial_states or env.initial_states
         self.buffer, self._rng = make_buffer(buffer_size, env.device, seed)
-        self._exploration = Exploration(exploration_noise, exploration)
-        self._collector = Collector(
-            env,
-            PlayedPolicy(actor, self._exploration, control_variate),
-            frames_per_batch=frames_per_batch,
-            total_frames=-1,
-            init_random_frames=-(-warmup_frames // frames_per_batch) * frames_per_batch,
-            track_traj_ids=False,
-            auto_register_policy_transforms=False,
-        )
-        self._batches = iter(self._collector)
-        self._transitions = Transitions(n_steps)
+        policy = PlayedPolicy(actor, Exploration(exploration_noise, exploration), control_variate)
+        self._player = Player(env, policy, frames_per_batch, warmup_frames, n_steps)
 
     @property
     def initial_states(self) -> InitialStates:
@@ -77,23 +67,23 @@ class SyncCollector:
 
     @property
     def n_steps(self) -> int:
-        return self._transitions.n_steps
+        return self._player.transitions.n_steps
 
     @property
     def exploration_noise(self) -> float:
-        return self._exploration.deviation
+        return self._player.policy.exploration.deviation
 
     def play(self, initial_states: InitialStates, n_steps: int, exploration_noise: float) -> None:
-        self.env.initial_states, self._transitions = initial_states, Transitions(n_steps)
-        if exploration_noise != self.exploration_noise:
-            self._exploration.deviation = exploration_noise
+        other_noise = exploration_noise != self.exploration_noise
+        self._player.settle(initial_states, n_steps, exploration_noise)
+        if other_noise:
             self.buffer.empty()
 
     def warm_start(self, buffer: dict[str, Any] | None) -> None:
         if buffer is not None:
             fill_buffer(self.buffer, self._rng.device, self.env, buffer)
         # The count of frames is part of the state; after this one, TorchRL's collector plays no more random actions.
-        self._load_frames(self._collector.init_random_frames)
+        self._player.count(self._player.collector.init_random_frames)
 
     def start(self) -> None:
         while len(self.buffer) < min(self.warmup_frames, self.buffer.storage.max_size):
@@ -105,29 +95,26 @@ class SyncCollector:
         self.start()  # a stage may have emptied the buffer
 
     def close(self) -> None:
-        self._collector.shutdown()
+        self._player.collector.shutdown()
 
     def state_dict(self) -> dict[str, Any]:
         return {
             "buffer": buffer_state(self.buffer, self._rng),
             "exploration_noise": self.exploration_noise,
-            "frames": self._collector.state_dict()["frames"],
-            "carrier": carried(self._collector).to_dict(),
+            "frames": self._player.collector.state_dict()["frames"],
+            "carrier": carried(self._player.collector).to_dict(),
             "env_rng": self.env.rng.get_state(),
             "supply": self.env.supply.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         load_buffer(self.buffer, self._rng, state["buffer"])
-        self._exploration.deviation = state["exploration_noise"]
+        self._player.policy.exploration.deviation = state["exploration_noise"]
         # TorchRL does not save the state of environments; that of a ReachAvoidEnv is the carried TensorDict.
-        self._load_frames(state["frames"])
-        carried(self._collector).update(TensorDict(state["carrier"], device=self.env.device))
+        self._player.count(state["frames"])
+        carried(self._player.collector).update(TensorDict(state["carrier"], device=self.env.device))
         restore_rng(self.env.rng, state["env_rng"])
         self.env.supply.load_state_dict(state["supply"])
 
-    def _load_frames(self, frames: int) -> None:
-        self._collector.load_state_dict({**self._collector.state_dict(), "frames": frames})  # type: ignore[arg-type]
-
     def _collect(self) -> None:
-        self.buffer.extend(self._transitions(next(self._batches)))
+        self.buffer.extend(self._player.play())

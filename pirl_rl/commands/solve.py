@@ -61,8 +61,9 @@ def solve(
     # Evaluators and figures take what has the methods of a solution.
     solution: Any = solver.solve()
     seconds = time.perf_counter() - started
-    save_config(config, folder)
+    # The configuration comes last: a directory with it counts as begun, and must tell its overrides.
     OmegaConf.save(overrides, run.overrides)
+    save_config(config, folder)
     record_session(run, overrides, "cpu")
     solution.save(run.grid)
     evaluators = make_evaluators(config.evaluation, "final", trust)

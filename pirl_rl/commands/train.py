@@ -66,9 +66,32 @@ def train(config: DictConfig) -> float:
     overrides = hydra_config.overrides.task
     foreign = dict.fromkeys(name for name in [*config.trust, *named_modules(overrides)] if name != PACKAGE.name)
     again = [f"trust=[{','.join(foreign)}]"] if foreign else []
-    with reported(folder, one_of_many=hydra_config.mode == RunMode.MULTIRUN, again=again):
-        summary = train_new(config, folder, overrides)
+    in_sweep = hydra_config.mode == RunMode.MULTIRUN
+    with reported(folder, one_of_many=in_sweep, again=again):
+        summary = (train_in_sweep if in_sweep else train_new)(config, folder, overrides)
     return summary.get("value_mse", summary.get("hjb_sup_loss", float("nan")))
+
+
+def train_in_sweep(config: DictConfig, folder: Path, overrides: Sequence[str]) -> dict[str, float]:
+    """Train a run of a sweep that may have been started before: what is finished is not repeated, and what was begun is
+    resumed. Returns the summary.
+
+    Raises:
+        PirlError: as `train_new` and `go_on` do, or if the directory has a run with other settings.
+    """
+    run = RunDirectory(folder)
+    if not run.config.exists():
+        return train_new(config, folder, overrides)
+    recorded = OmegaConf.load(run.overrides) if run.overrides.exists() else None
+    if recorded != overrides:
+        raise ConfigError(
+            f"hydra.sweep.dir: expected a new directory or that of the same sweep, but {folder} holds a run with "
+            f"{' '.join(recorded or ['unknown settings'])} in place of {' '.join(overrides)}"
+        )
+    if run.summary.exists():
+        print(f"run      {run} is finished already", flush=True)
+        return run.numbers()
+    return go_on(folder, [], [*config.trust, *named_modules(overrides)])
 
 
 def train_new(
@@ -104,20 +127,34 @@ def train_new(
         trainer = make_trainer(config, folder, trust, problem)
         if config.start is not None:
             _start(trainer, config)
-        save_config(config, folder)
+        # The configuration comes last: a directory with it counts as begun, and must tell its overrides.
         OmegaConf.save(overrides, RunDirectory(folder).overrides)
+        save_config(config, folder)
         record_session(RunDirectory(folder), overrides, trainer.solution.device)
         return _train(trainer, config, trust)
 
 
 def resume(folder: Path, overrides: Sequence[str]) -> None:
-    """Resume a run, with overrides `key=value` that change its configuration for good."""
+    """Resume a run as the command does, with errors as messages."""
+    with reported(folder, again=[text for text in overrides if text.startswith("trust=")]):
+        go_on(folder, overrides)
+
+
+def go_on(folder: Path, overrides: Sequence[str], trust: Sequence[str] = ()) -> dict[str, float]:
+    """Resume a run; returns the summary.
+
+    Args:
+        folder: the run directory.
+        overrides: overrides `key=value` that change its configuration for good. The modules that they name are trusted.
+        trust: further modules outside the package that the configuration may name.
+
+    Raises:
+        PirlError: if the run cannot be resumed, or training diverges or is interrupted.
+    """
     run = RunDirectory(folder)
-    trust = [text for text in overrides if text.startswith("trust=")]
-    with reported(folder, again=trust), contextlib.ExitStack() as held:
-        config = load_config(folder)
-        run.refuse_links()
-        held.enter_context(locked(run))
+    config = load_config(folder)
+    run.refuse_links()
+    with locked(run):
         config.trust = []
         for text in overrides:
             if text.startswith("start="):
@@ -127,7 +164,7 @@ def resume(folder: Path, overrides: Sequence[str]) -> None:
                 print(f"resume: {text.partition('=')[0]} was {before}, and is {after} from now on", flush=True)
         if config.get("grid") is not None:
             raise ConfigError(f"resume: expected a run that was trained, but {folder} holds the solution of a grid")
-        modules = [*config.trust, *named_modules(overrides)]
+        modules = [*config.trust, *named_modules(overrides), *trust]
         trainer = make_trainer(config, folder, modules)
         if run.last.exists():
             restore(trainer)
@@ -137,7 +174,7 @@ def resume(folder: Path, overrides: Sequence[str]) -> None:
                 _start(trainer, config)
         save_config(config, folder)
         record_session(run, [f"resume={folder.name}", *overrides], trainer.solution.device)
-        _train(trainer, config, modules)
+        return _train(trainer, config, modules)
 
 
 def _start(trainer: Trainer, config: DictConfig) -> None:
