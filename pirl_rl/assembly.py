@@ -206,7 +206,8 @@ def choose_paths(config: DictConfig, problem: ReachAvoidProblem) -> None:
 
 def choose_probes(config: DictConfig, problem: ReachAvoidProblem) -> str:
     """Replace `auto` in loss.hjb_probes by a number, and give the reason where the trace is estimated, else ""."""
-    if config.loss.get("hjb_probes") != AUTO:
+    # What is no node of settings is refused where the loss is built.
+    if not isinstance(config.loss, DictConfig) or config.loss.get("hjb_probes") != AUTO:
         return ""
     channels = noise_channels(problem)
     config.loss.hjb_probes = PROBES if channels > MOST_COLUMNS else 0
