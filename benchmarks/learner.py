@@ -156,7 +156,7 @@ class Variant:
     @staticmethod
     def _descend(params: list[Tensor], gradient: tuple[Tensor, ...], optimiser: torch.optim.Optimizer) -> None:
         for parameter, entry in zip(params, gradient, strict=True):
-            parameter.grad = entry
+            parameter.grad = entry.contiguous()
         optimiser.step()
 
 

@@ -188,7 +188,8 @@ class Learner:
             loss, terms, gradient = (self._critic_loss if which == "critic" else self._actor_loss)(batch)
             params = self.loss.qvalue_network_params if which == "critic" else self.loss.actor_network_params
             for parameter, entry in zip(params.parameters(), gradient, strict=True):
-                parameter.grad = entry
+                # Fused optimisers read a gradient in the order of the memory of its parameter.
+                parameter.grad = None if entry is None else entry.contiguous()
             return loss, terms
 
         try:

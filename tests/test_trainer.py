@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import math
 
@@ -12,6 +13,7 @@ from small import PHYSICS, assert_same, at_update, interrupt, resumed, small_tra
 from pirl_rl.checkpoint import load
 from pirl_rl.errors import CheckpointError, DivergenceError, Interrupted
 from pirl_rl.run_directory import RunDirectory
+from pirl_rl.schedules import WEIGHTS
 
 
 def last(folder) -> dict:
@@ -169,3 +171,22 @@ def test_progress_shows_figures_without_a_terminal(tmp_path, capfd):
     assert "update 4/20: value_mse" in capfd.readouterr().err
     small_trainer(tmp_path / "quiet", "trainer.evaluate_every=0").train()
     assert "update 3/20: train_td_loss" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("compile", ["false", "true"])
+def test_an_update_is_a_step_of_the_optimiser_along_the_gradient_of_backward(compile, tmp_path):
+    """Gradients are in the memory order of their parameters, which fused optimisers take for granted."""
+    trainer = small_trainer(tmp_path, *PHYSICS, f"compile={compile}")
+    trainer.collector.start()
+    learner, weights = trainer.learner, (1.0, 1.0, 1.0)
+    batch = trainer.batches.sample(weights, 0.0)
+    expected = copy.deepcopy(learner.loss)
+    for name, value in zip(WEIGHTS, weights, strict=True):
+        setattr(expected, name, value)
+    expected.critic_loss(batch)[0].backward()
+    torch.optim.Adam(expected.qvalue_network_params.parameters(), learner.rate(0.0)).step()
+    learner.update(batch, 1, weights, 0.0)
+    pairs = zip(
+        learner.loss.qvalue_network_params.parameters(), expected.qvalue_network_params.parameters(), strict=True
+    )
+    assert all(torch.allclose(one, other, atol=1e-5) for one, other in pairs)

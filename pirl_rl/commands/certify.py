@@ -50,7 +50,6 @@ from __future__ import annotations
 
 import inspect
 import json
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -58,13 +57,13 @@ from typing import Any
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from pirl_rl.commands.console import quiet_libraries, reported
+from pirl_rl.commands.console import program, reported
 from pirl_rl.commands.report import draw_again
 from pirl_rl.errors import ConfigError, ProofError
 from pirl_rl.figures.files import save_figures
 from pirl_rl.figures.proof import draw_proof
 from pirl_rl.files import replacing
-from pirl_rl.progress import announce, helped
+from pirl_rl.progress import announce
 from pirl_rl.proofs import LowerBound, UpperBound
 from pirl_rl.proofs.proof import LEVELS
 from pirl_rl.run_directory import RunDirectory
@@ -81,11 +80,8 @@ BOUNDS = ("lower", "upper")
 """The bounds that can be proved."""
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    arguments = sys.argv[1:] if arguments is None else arguments
-    if helped(arguments, __doc__):
-        return
-    quiet_libraries()
+@program
+def main(arguments: Sequence[str]) -> None:
     named = [item for item in arguments if item.startswith("run=")]
     folder = Path(named[-1].partition("=")[2]) if named else Path()
     with reported(folder):

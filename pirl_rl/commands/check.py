@@ -28,17 +28,13 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from pirl_rl.checking import Finding, check, examine, report
-from pirl_rl.commands.console import quiet_libraries, reported
+from pirl_rl.commands.console import program, reported
 from pirl_rl.errors import ConfigError
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.progress import helped
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    arguments = sys.argv[1:] if arguments is None else arguments
-    if helped(arguments, __doc__):
-        return
-    quiet_libraries()
+@program
+def main(arguments: Sequence[str]) -> None:
     with reported(Path()):
         named = [text for text in arguments if "=" not in text]
         if len(named) != 1:

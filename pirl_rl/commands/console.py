@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
 import os
 import shlex
 import sys
 import textwrap
 import traceback
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from pirl_rl.errors import INTERRUPTED, ConfigError, Interrupted, PirlError
 from pirl_rl.places import is_users, users_frames
+from pirl_rl.progress import helped
 
 EXPECTED = (PirlError, HydraException, OmegaConfBaseException)
 """Errors whose message alone tells the user what to correct."""
@@ -32,6 +34,23 @@ UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES
 def quiet_libraries() -> None:
     """Silence the warnings of torch and TorchRL about each other, about which a user can do nothing."""
     warnings.filterwarnings("ignore", category=FutureWarning, module=r"(torch|tensordict|torchrl)\b")
+
+
+def program(function: Callable[[Sequence[str]], None]) -> Callable[..., None]:
+    """Make a command of a function of its arguments, with the help that the docstring of its module is.
+
+    Without arguments the command takes those of the command line.
+    """
+
+    @functools.wraps(function)
+    def main(arguments: Sequence[str] | None = None) -> None:
+        given = sys.argv[1:] if arguments is None else arguments
+        if helped(given, sys.modules[function.__module__].__doc__):
+            return
+        quiet_libraries()
+        function(given)
+
+    return main
 
 
 Meanings = Mapping[str, Mapping[str, str]]

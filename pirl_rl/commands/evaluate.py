@@ -18,29 +18,26 @@ Examples:
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from omegaconf import open_dict
 
 from pirl_rl.assembly import make_evaluation_simulator, make_evaluators
-from pirl_rl.commands.console import named_modules, outcome, override, reported
+from pirl_rl.commands.console import named_modules, outcome, override, program, reported
 from pirl_rl.commands.report import draw_again
 from pirl_rl.configuration import load_config
 from pirl_rl.errors import ConfigError
 from pirl_rl.evaluation import evaluate, lines_of, meanings_of, metrics_of, statements_of
 from pirl_rl.figures import draw_run
 from pirl_rl.files import replacing
-from pirl_rl.progress import announce, helped
+from pirl_rl.progress import announce
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.runs.load import load_run
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    arguments = sys.argv[1:] if arguments is None else arguments
-    if helped(arguments, __doc__):
-        return
+@program
+def main(arguments: Sequence[str]) -> None:
     named = [item for item in arguments if item.startswith("run=")]
     folder = Path(named[-1].partition("=")[2]) if named else Path()
     run = RunDirectory(folder)

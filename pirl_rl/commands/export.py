@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -31,11 +30,10 @@ from omegaconf import DictConfig
 
 from pirl_rl import checkpoint
 from pirl_rl.checkpoint import TARGET
-from pirl_rl.commands.console import quiet_libraries, reported
+from pirl_rl.commands.console import program, reported
 from pirl_rl.configuration import load_config, save_config
 from pirl_rl.deployment import FORMATS, write_model
 from pirl_rl.errors import ConfigError
-from pirl_rl.progress import helped
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.runs.load import load_run
 
@@ -139,10 +137,8 @@ def _write(source: RunDirectory, config: DictConfig, state: dict[str, Any], copy
     return path
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    arguments = sys.argv[1:] if arguments is None else arguments
-    if helped(arguments, __doc__):
-        return
+@program
+def main(arguments: Sequence[str]) -> None:
     named = dict(item.split("=", 1) for item in arguments if "=" in item)
     with reported(Path(named.get("run", "."))):
         if not {"run", "out"} <= {*named} <= {"run", "out", "format", "trust"} or len(named) != len(arguments):
@@ -156,7 +152,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if kind == "run":
             path = export(run, out)
         else:
-            quiet_libraries()
             path = export_model(run, out, kind, _modules(named.get("trust", "[]")))
     print(f"written  {path}")
 

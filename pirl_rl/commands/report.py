@@ -23,22 +23,19 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from pirl_rl.commands.console import quiet_libraries, reported
+from pirl_rl.commands.console import program, reported
 from pirl_rl.configuration import PACKAGE
 from pirl_rl.errors import ConfigError
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.progress import announce, helped
+from pirl_rl.progress import announce
 from pirl_rl.reports import write_report
 from pirl_rl.run_directory import RunDirectory
 
 KEYS = ("run", "out", "trust")
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    arguments = sys.argv[1:] if arguments is None else arguments
-    if helped(arguments, __doc__):
-        return
-    quiet_libraries()
+@program
+def main(arguments: Sequence[str]) -> None:
     with reported(Path()):
         given: dict[str, list[str]] = {key: [] for key in KEYS}
         for text in arguments:

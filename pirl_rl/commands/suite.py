@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -37,13 +36,12 @@ from omegaconf.errors import OmegaConfBaseException
 
 from pirl_rl.assembly import make_problem
 from pirl_rl.commands.composition import compose
-from pirl_rl.commands.console import quiet_libraries, reported
+from pirl_rl.commands.console import program, reported
 from pirl_rl.commands.train import resume, train_new
 from pirl_rl.configuration import load_config
 from pirl_rl.errors import ConfigError
 from pirl_rl.figures import draw_suite, save_figures
 from pirl_rl.files import replacing
-from pirl_rl.progress import helped
 from pirl_rl.rivals import RIVALS
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.runs.load import load_run
@@ -75,11 +73,8 @@ STATES_SEED = 30_000
 """The seed of the states at which runs are measured; neither trainings nor the choice of the recipe use it."""
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    arguments = sys.argv[1:] if arguments is None else arguments
-    if helped(arguments, __doc__):
-        return
-    quiet_libraries()
+@program
+def main(arguments: Sequence[str]) -> None:
     with reported(Path()):
         options, overrides = _options(arguments)
         folder, scores, sources, others = Path(options["out"]), {}, {}, {}
