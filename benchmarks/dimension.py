@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from tensordict import TensorDict
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
@@ -95,18 +96,21 @@ class Term:
         self.critic = Critic(self.problem, (64, 64, 64), output="Sigmoid", **RECIPE)
         self.build(probes, delta)
         self.collocation, self.rng = Collocation(self.problem, case.points), torch.Generator().manual_seed(0)
-        self.batch = self.collocation.sample(self.rng)
-        self.hjb_loss: Callable[..., Tensor] = compiled(self.loss._hjb_loss) if compile else self.loss._hjb_loss
+        action = torch.zeros(1, self.problem.controls.dim)
+        points = self.collocation.sample(self.rng)
+        self.batch = TensorDict({"replay": TensorDict({"action": action}), "collocation": points})
+        if compile:
+            self.hjb_loss = compiled(self.loss.critic_loss)
 
     def build(self, probes: int, delta: float | None) -> None:
         """The loss of the networks as they are."""
-        options: dict[str, Any] = {"hjb_probes": probes, "hjb_delta": delta}
+        options: dict[str, Any] = {"hjb_probes": probes, "hjb_delta": delta, "hjb_weight": 1.0}
         self.loss = PIRLLoss(self.problem, self.actor, [self.critic], Hamiltonian(self.problem), **options)
-        self.hjb_loss = self.loss._hjb_loss
+        self.hjb_loss: Callable[..., tuple[Tensor, Any]] = self.loss.critic_loss
 
     def both(self) -> Tensor:
         """The loss, followed by all entries of its gradient."""
-        loss = self.hjb_loss(self.batch)
+        loss, _ = self.hjb_loss(self.batch)
         slopes = torch.autograd.grad(loss, list(self.loss.qvalue_network_params.parameters()), materialize_grads=True)
         return torch.cat([loss.detach().view(1), *(slope.flatten() for slope in slopes)])
 

@@ -28,7 +28,7 @@ from torch import Tensor
 from pirl_rl import compilation
 from pirl_rl.actor_rules import Q
 from pirl_rl.learner import with_gradient
-from pirl_rl.losses import PIRLLoss
+from pirl_rl.losses import Networks, PIRLLoss
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems import Reach1D
@@ -59,11 +59,14 @@ class SevenStates(ReachAvoidProblem):
 class NestedLoss(PIRLLoss):
     """`PIRLLoss` with the generator, Eq. (parabolic_operator), by nested autograd."""
 
-    def _residuals(self, tau: Tensor, x: Tensor, action: Tensor, u: Tensor) -> Tensor:
+    def _residuals(
+        self, networks: Networks, points: TensorDictBase, action: Tensor, probes: Tensor | None = None
+    ) -> Tensor:
+        tau, x, u = points["tau"].squeeze(-1), points["state"], self.problem.controls.denormalize(action)
         f, sigma = self.problem.drift(x, u), self.problem.diffusion(x, u)
         count = self.num_qvalue_nets
         y = torch.cat([tau.unsqueeze(-1), x], -1).expand(count, -1, -1).contiguous().requires_grad_()
-        with self._critics() as critic:
+        with self._critics(networks.critic) as critic:
             value = critic(y[..., :1], y[..., 1:], action.expand(count, -1, -1))
         (gradient,) = torch.autograd.grad(value.sum(), y, create_graph=True)
         result = -gradient[..., 0] + (gradient[..., 1:] * f).sum(-1)
@@ -151,7 +154,7 @@ class Variant:
         self.hjb_loss(self.batch["collocation"])
 
     def _hjb_loss(self, points: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        return self.loss._hjb_loss(points), {}
+        return self.loss._hjb_loss(self.loss.networks, points, TensorDict()), {}
 
     @staticmethod
     def _descend(params: list[Tensor], gradient: tuple[Tensor, ...], optimiser: torch.optim.Optimizer) -> None:

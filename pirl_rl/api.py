@@ -9,11 +9,12 @@ import warnings
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 from pirl_rl.assembly import make_evaluation_simulator, make_evaluators
 from pirl_rl.checking import check
 from pirl_rl.commands.console import named_modules, override, quiet_libraries
+from pirl_rl.commands.population import member_names
 from pirl_rl.commands.settings import compose_run, run_folder, typed_settings
 from pirl_rl.commands.train import train_new
 from pirl_rl.errors import ArgumentError, ConfigError
@@ -27,16 +28,34 @@ from pirl_rl.runs.run import Run
 __all__ = ["check", "evaluate", "load_run", "monte_carlo", "train"]
 
 
+@overload
 def train(
     problem_or_experiment: ReachAvoidProblem | type[ReachAvoidProblem] | str,
     *,
     folder: str | PathLike[str] | None = None,
+    seeds: None = None,
     **settings: Any,
-) -> Run:
+) -> Run: ...
+@overload
+def train(
+    problem_or_experiment: ReachAvoidProblem | type[ReachAvoidProblem] | str,
+    *,
+    folder: str | PathLike[str] | None = None,
+    seeds: Sequence[int],
+    **settings: Any,
+) -> list[Run]: ...
+def train(
+    problem_or_experiment: ReachAvoidProblem | type[ReachAvoidProblem] | str,
+    *,
+    folder: str | PathLike[str] | None = None,
+    seeds: Sequence[int] | None = None,
+    **settings: Any,
+) -> Run | list[Run]:
     """Train like `python -m pirl_rl.train`, in a new run directory.
 
         run = pirl_rl.train("reach1d", updates=2_000, seed=3)
         run = pirl_rl.train(MyProblem, method="pirl", **{"schedule.center": 1e3})
+        runs = pirl_rl.train("reach1d", seeds=[0, 1, 2])
 
     Args:
         problem_or_experiment: the name of an experiment, or a problem of your own, a class or an object, which is
@@ -44,12 +63,13 @@ def train(
             imported. It cannot name an object or a class of a notebook, so that such a run is opened with
             `load_run(folder, problem=...)`.
         folder: the run directory, new or empty; the default is `runs/<experiment>/<time>-<seed>`.
+        seeds: trains a population with one member for each seed, see `pirl_rl.population`.
         **settings: an argument of the trainer (`updates=200`), a key of the configuration (`seed=3`, `compile=False`),
             a choice of a group (`method="td3"`, `logger="none"`), a nested mapping (`schedule={"center": 1e3}`) or a
             key with dots (`**{"schedule.center": 1e3}`).
 
     Returns:
-        The run, opened from its directory.
+        The run, opened from its directory, or the runs of all members of a population.
 
     Raises:
         ConfigError: for an unknown setting, or a value that cannot be built; the message lists the known settings.
@@ -60,13 +80,18 @@ def train(
     if "resume" in settings:
         raise ConfigError("resume: expected settings of a new run; resume with python -m pirl_rl.train resume=RUN_DIR")
     experiment, problem, named, trust = _subject(problem_or_experiment)
+    if seeds is not None:
+        settings["trainer.seeds"] = list(seeds)
     config, typed = compose_run(experiment, {**named, **settings})
     default = run_folder(config)
     path = Path(default if folder is None else folder).absolute()
     with warnings.catch_warnings():
         quiet_libraries()
         train_new(config, path, typed, trust, problem)
-    return load_run(path, [*config.trust, *named_modules(typed), *trust], problem=problem)
+    modules = [*config.trust, *named_modules(typed), *trust]
+    if seeds is not None:
+        return [load_run(path / name, modules, problem=problem) for name in member_names(config)]
+    return load_run(path, modules, problem=problem)
 
 
 def _subject(subject: Any) -> tuple[str, ReachAvoidProblem | None, dict[str, str], list[str]]:

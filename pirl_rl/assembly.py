@@ -127,7 +127,7 @@ def make_trainer(
     choose_paths(config, problem)
     reason = choose_probes(config, problem)
     supplied = {"problem": problem, "seed": physics, "device": device, "compile_simulator": config.compile}
-    env: ReachAvoidEnv = build(_without_problem(config), "env", trust, **supplied)
+    env: ReachAvoidEnv = build(_without(config, "env", "problem"), "env", trust, **supplied)
     parts = {"problem": problem, "simulator": env.simulator}
     actor, critics = make_networks(config, problem, trust)
     with warnings.catch_warnings():
@@ -137,8 +137,10 @@ def make_trainer(
         loss = build(config.loss, "loss", trust, parts, problem=problem, actor=actor, critics=critics).to(device)
     actor = loss.actor_network.module
     learned = parts | {"solution": loss.solution(), "others": env.initial_states, "compile": config.compile}
+    if config.trainer.get("seeds") is not None:
+        raise ConfigError(f"trainer.seeds: expected null for a single run, got {config.trainer.seeds}")
     trainer: Trainer = build(
-        config.trainer,
+        _without(config, "trainer", "seeds"),
         "trainer",
         trust,
         learner=build(config.learner, "learner", trust, loss=loss),
@@ -217,12 +219,12 @@ def choose_probes(config: DictConfig, problem: ReachAvoidProblem) -> str:
     return f"The HJB residual takes {instead}; loss.hjb_probes=0 is exact."
 
 
-def _without_problem(config: DictConfig) -> DictConfig:
-    """The settings of the environment without the problem, in a copy of the configuration, to whose keys they refer."""
+def _without(config: DictConfig, node: str, key: str) -> DictConfig:
+    """A node of the configuration without a key, in a copy of the whole, to whose keys it may refer."""
     others = copy.deepcopy(config)
     with open_dict(others):
-        others.env.pop("problem", None)
-    return others.env
+        others[node].pop(key, None)
+    return others[node]
 
 
 def _make_stage(node: DictConfig, key: str, trust: Sequence[str], parts: Mapping[str, Any]) -> Stage:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import torch
@@ -27,12 +27,15 @@ Terms = dict[str, Tensor]
 LossFunction = Callable[[TensorDictBase], tuple[Tensor, Terms]]
 """Maps a batch to a loss, and to terms of it by name."""
 
-Differentiated = Callable[[TensorDictBase], tuple[Tensor, Terms, tuple[Tensor | None, ...]]]
-"""Maps a batch to a loss, its terms and its gradient in the parameters."""
+Gradient = tuple[Tensor, Terms, tuple[Tensor | None, ...]]
+"""A loss, its terms and its gradient in the parameters."""
 
 
 class Learner:
     """Updates the networks of a loss.
+
+    Attributes:
+        loss_actor: the loss of the actor's last update, NaN before the first.
 
     Args:
         loss: the loss, with the critics, the actor and their target networks.
@@ -75,7 +78,7 @@ class Learner:
         self.actor_optimizers = optimizers(loss.actor_network_params, learning_rate, optimizer)
         self.train_actor = True
         self.compile = compile
-        self._loss_actor = torch.tensor(math.nan)
+        self.loss_actor = torch.tensor(math.nan)
         self._moments_rule = _name(loss.actor_rule)
         self._compile_critic_loss()
         self._compile_actor_loss()
@@ -110,23 +113,45 @@ class Learner:
         Raises:
             DivergenceError: a loss is not finite or too large; the networks are as before the step that it would make.
         """
+        self.prepare(weights, decay)
+        batch = self.loss.with_noise(batch)
+        terms = self.step_critics(self._differentiated("critic", batch), k)
+        if k % self.actor_every == 0:
+            if self.train_actor:
+                self.step_actor(self._differentiated("actor", batch), k)
+            self.targets.step()
+        return {**terms, "loss_actor": self.loss_actor}
+
+    # The next three are the parts of an update around the losses, which a population evaluates for all its members.
+
+    def prepare(self, weights: Weights, decay: float) -> None:
+        """Set the loss weights and the learning rate of an update; arguments are those of `update`."""
         for name, value in zip(WEIGHTS, weights, strict=True):
             setattr(self.loss, name, value)
         for optimizer in (*self.critic_optimizers, *self.actor_optimizers):
             optimizer.param_groups[0]["lr"] = self.rate(decay)
-        loss, terms = self._differentiated("critic", batch)
-        self._check(loss, terms, k + 1)
-        for optimizer in self.critic_optimizers:
-            optimizer.step()
-        if k % self.actor_every == 0:
-            if self.train_actor:
-                loss_actor, _ = self._differentiated("actor", batch)
-                self._check(loss_actor, {"loss_actor": loss_actor}, k + 1)
-                for optimizer in self.actor_optimizers:
-                    optimizer.step()
-                self._loss_actor = loss_actor
-            self.targets.step()
-        return {**terms, "loss_actor": self._loss_actor}
+
+    def step_critics(self, found: Gradient, k: int) -> Terms:
+        """Step the critics along the gradient of update `k`; returns the unweighted terms of the loss.
+
+        Raises:
+            DivergenceError: the loss is not finite or too large; the networks stay as they are.
+        """
+        loss, terms, gradient = found
+        _check(loss, terms, k + 1)
+        _descend(self.critic_optimizers, self.loss.qvalue_network_params, gradient)
+        return terms
+
+    def step_actor(self, found: Gradient, k: int) -> None:
+        """Step the actor along the gradient of update `k`.
+
+        Raises:
+            DivergenceError: the loss is not finite or too large; the networks stay as they are.
+        """
+        loss, _, gradient = found
+        _check(loss, {"loss_actor": loss}, k + 1)
+        _descend(self.actor_optimizers, self.loss.actor_network_params, gradient)
+        self.loss_actor = loss
 
     def rate(self, decay: float) -> float:
         """The learning rate at a progress of its decay in [0, 1]."""
@@ -146,7 +171,7 @@ class Learner:
     def state_dict(self) -> dict[str, Any]:
         return {
             "loss": self.loss.state_dict(),
-            "loss_actor": self._loss_actor,
+            "loss_actor": self.loss_actor,
             "actor_rule": self._moments_rule,
             "critic_optimizers": [optimizer.state_dict() for optimizer in self.critic_optimizers],
             "actor_optimizers": [optimizer.state_dict() for optimizer in self.actor_optimizers],
@@ -154,7 +179,7 @@ class Learner:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.loss.load_state_dict(state["loss"])
-        self._loss_actor, self._moments_rule = state["loss_actor"], state["actor_rule"]
+        self.loss_actor, self._moments_rule = state["loss_actor"], state["actor_rule"]
         for name in ("critic_optimizers", "actor_optimizers"):
             if len(own := getattr(self, name)) != len(state[name]):
                 raise ArgumentError(
@@ -178,19 +203,11 @@ class Learner:
     def _compiler(self) -> Callable[[Any], Any]:
         return compiled if self.compile else lambda function: function
 
-    def _differentiated(self, which: Literal["critic", "actor"], batch: TensorDictBase) -> tuple[Tensor, Terms]:
-        """A loss and its terms, with its gradient noted at the parameters.
+    def _differentiated(self, which: Literal["critic", "actor"], batch: TensorDictBase) -> Gradient:
+        """A loss, its terms and its gradient. If compilation fails, the losses run eagerly from then on."""
 
-        If compilation fails, the losses run eagerly from then on.
-        """
-
-        def evaluate() -> tuple[Tensor, Terms]:
-            loss, terms, gradient = (self._critic_loss if which == "critic" else self._actor_loss)(batch)
-            params = self.loss.qvalue_network_params if which == "critic" else self.loss.actor_network_params
-            for parameter, entry in zip(params.parameters(), gradient, strict=True):
-                # Fused optimisers read a gradient in the order of the memory of its parameter.
-                parameter.grad = None if entry is None else entry.contiguous()
-            return loss, terms
+        def evaluate() -> Gradient:
+            return (self._critic_loss if which == "critic" else self._actor_loss)(batch)
 
         try:
             return evaluate()
@@ -203,13 +220,24 @@ class Learner:
             warnings.warn(f"updates run eagerly, about half as fast: {reason_of(error)}", stacklevel=3)
             return evaluate()
 
-    @staticmethod
-    def _check(loss: Tensor, terms: dict[str, Tensor], update: int) -> None:
-        if abs(loss.item()) < EXPLOSION:
-            return
-        found = ", ".join(f"{name} = {term.item():.3g}" for name, term in terms.items())
-        worst = max(terms, key=lambda name: math.inf if math.isnan(value := terms[name].item()) else abs(value))
-        raise DivergenceError(f"update {update}: {worst} is not finite or above {EXPLOSION:.0e}: {found}")
+
+def _check(loss: Tensor, terms: Terms, update: int) -> None:
+    if abs(loss.item()) < EXPLOSION:
+        return
+    found = ", ".join(f"{name} = {term.item():.3g}" for name, term in terms.items())
+    worst = max(terms, key=lambda name: math.inf if math.isnan(value := terms[name].item()) else abs(value))
+    raise DivergenceError(f"update {update}: {worst} is not finite or above {EXPLOSION:.0e}: {found}")
+
+
+def _descend(
+    optimizers: Sequence[torch.optim.Optimizer], params: TensorDictParams, gradient: Sequence[Tensor | None]
+) -> None:
+    """Make a step of each optimiser along the gradient in the parameters."""
+    for parameter, entry in zip(params.parameters(), gradient, strict=True):
+        # Fused optimisers read a gradient in the order of the memory of its parameter.
+        parameter.grad = None if entry is None else entry.contiguous()
+    for optimizer in optimizers:
+        optimizer.step()
 
 
 def _name(rule: object) -> str:
@@ -217,11 +245,11 @@ def _name(rule: object) -> str:
     return type(rule).__qualname__
 
 
-def with_gradient(function: LossFunction, params: TensorDictParams) -> Differentiated:
+def with_gradient(function: LossFunction, params: TensorDictParams) -> Callable[[TensorDictBase], Gradient]:
     """The loss with its gradient in the parameters, so that compiled code computes both in one program."""
     parameters = tuple(params.parameters())
 
-    def differentiated(batch: TensorDictBase) -> tuple[Tensor, Terms, tuple[Tensor | None, ...]]:
+    def differentiated(batch: TensorDictBase) -> Gradient:
         loss, terms = function(batch)
         return loss.detach(), terms, torch.autograd.grad(loss, parameters, allow_unused=True)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -27,6 +27,9 @@ from pirl_rl.problem import ReachAvoidProblem, noise_channels
 from pirl_rl.schedules import WEIGHTS
 from pirl_rl.solution import Solution
 
+TERMS = ("td_loss", "hjb_loss", "boundary_loss")
+"""The names of the terms of the critic loss, in the order of their weights."""
+
 TD_CRITERIA = ("squares", "cross_entropy")
 
 LARGEST_LOGIT = 10.0
@@ -36,6 +39,19 @@ LOGIT_WEIGHT = 0.1
 """The weight of the square of what a logit exceeds that by."""
 
 _cross_entropy = nn.functional.binary_cross_entropy_with_logits
+
+
+class Networks(NamedTuple):
+    """The numbers that the losses read: the parameters of all networks, and the weights (w_TD, w_HJB, w_BC).
+
+    With a leading axis over the members of a population, `torch.func.vmap` maps them to the losses of all members.
+    """
+
+    critic: TensorDictBase
+    actor: TensorDictBase
+    target_critic: TensorDictBase
+    target_actor: TensorDictBase
+    weights: Sequence[Tensor]
 
 
 class PIRLLoss(ScheduledTD3Loss):
@@ -150,31 +166,71 @@ class PIRLLoss(ScheduledTD3Loss):
         for name, value in zip(WEIGHTS, (td_weight, hjb_weight, boundary_weight), strict=True):
             self.register_coeff_buffer(name, float(value))
 
-    def critic_loss(self, batch: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The weighted critic loss, Eq. (critic_loss), and its unweighted terms."""
+    @property
+    def networks(self) -> Networks:
+        """The parameters and the weights of this loss."""
+        return Networks(
+            self.qvalue_network_params,
+            self.actor_network_params,
+            self.target_qvalue_network_params,
+            self.target_actor_network_params,
+            (self.td_weight, self.hjb_weight, self.boundary_weight),
+        )
+
+    def with_noise(self, batch: TensorDictBase) -> TensorDictBase:
+        """The batch with the random numbers of the critic loss as its part "noise".
+
+        The losses draw them for batches without this part. Compiled code would draw other numbers than eager code, so
+        that the learner adds them before.
+        """
+        noise, action = {}, batch["replay", "action"]
         # TD3Loss draws its smoothing noise before anything else; with the same order, both draw the same noise.
-        noise = self._clipped_noise(batch["replay", "action"], self.policy_noise, self.noise_clip)
-        parts, loss = {}, self.td_weight.new_zeros(())
-        if "next" in batch.get("replay").keys():
-            parts["td_loss"] = self._td_loss(batch["replay"], noise)
-            loss = loss + self.td_weight * parts["td_loss"]
+        if self.policy_noise:
+            noise["smoothing"] = _clipped_noise(action, self.policy_noise, self.noise_clip)
         if "collocation" in batch.keys():
-            parts["hjb_loss"] = self._hjb_loss(batch["collocation"])
-            loss = loss + self.hjb_weight * parts["hjb_loss"]
+            x = batch["collocation", "state"]
+            if self.hjb_noise:
+                like = x[:, :1].expand(-1, action.shape[-1])
+                noise["control"] = _clipped_noise(like, self.hjb_noise, self.hjb_noise_clip)
+            if self.hjb_probes:
+                noise["probes"] = rademacher(self.hjb_probes, x, self.channels)
+                if self.hjb_delta is not None:
+                    noise["probes_of_size"] = rademacher(self.hjb_probes, x, self.channels)
+        return batch.copy().set("noise", TensorDict(noise))
+
+    def critic_loss(self, batch: TensorDictBase, networks: Networks | None = None) -> tuple[Tensor, dict[str, Tensor]]:
+        """The weighted critic loss, Eq. (critic_loss), and its unweighted terms.
+
+        Args:
+            batch: see `PIRLLoss`; it may have the part "noise", see `with_noise`.
+            networks: replace the parameters and the weights of this loss.
+        """
+        networks = networks or self.networks
+        batch = batch if "noise" in batch.keys() else self.with_noise(batch)
+        noise, replay, parts = batch.get("noise"), batch.get("replay"), {}
+        if "next" in replay.keys():
+            parts["td_loss"] = self._td_loss(networks, replay, noise)
+        if "collocation" in batch.keys():
+            parts["hjb_loss"] = self._hjb_loss(networks, batch.get("collocation"), noise)
         if "boundary" in batch.keys():
-            parts["boundary_loss"] = self._boundary_loss(batch["boundary"])
-            loss = loss + self.boundary_weight * parts["boundary_loss"]
+            parts["boundary_loss"] = self._boundary_loss(networks, batch.get("boundary"))
+        weights = dict(zip(TERMS, networks.weights, strict=True))
+        loss = sum((weights[name] * part for name, part in parts.items()), torch.zeros_like(networks.weights[0]))
         return loss, {name: part.detach() for name, part in parts.items()}
 
-    def actor_loss(self, batch: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The negative objective of the actor rule, plus the logit penalty; no gradient reaches the critics."""
+    def actor_loss(self, batch: TensorDictBase, networks: Networks | None = None) -> tuple[Tensor, dict[str, Tensor]]:
+        """The negative objective of the actor rule, plus the logit penalty; no gradient reaches the critics.
+
+        Arguments are those of `critic_loss`.
+        """
+        networks = networks or self.networks
         tau, x = batch["replay", "tau"], batch["replay", "state"]
         loss = torch.zeros((), device=tau.device)
         if self.logit_penalty:
-            with self._actor() as actor:
+            with self._actor(networks.actor) as actor:
                 loss = loss + self.logit_penalty * actor.logits(tau, x).square().mean()
         points = batch["collocation"] if "collocation" in batch.keys() else batch["replay"]
-        with self._actor() as actor, self._critics("frozen") as critic:
+        with self._actor(networks.actor) as actor, self._critics(networks.critic.detach()) as critic:
             objective = self.actor_rule(Solution(self.problem, actor, critic), batch["replay"], points)
         return loss - objective, {}
 
@@ -201,51 +257,46 @@ class PIRLLoss(ScheduledTD3Loss):
         self.qvalue_network_params.to_module(critics, preserve_module_state=False)
         return Solution(self.problem, self.actor_network.module, critics.module)  # type: ignore[arg-type]
 
-    def _act(self, tau: Tensor, state: Tensor, target: bool = False) -> Tensor:
-        """The (target) actor's output: (N, 1), (N, n) -> (N, m) in [-1, 1]."""
-        with self._actor(target) as actor:
-            return actor(tau, state)
-
     @contextmanager
-    def _actor(self, target: bool = False) -> Iterator[Actor]:
-        params = self.target_actor_network_params if target else self.actor_network_params
+    def _actor(self, params: TensorDictBase) -> Iterator[Actor]:
+        """The actor module on given parameters."""
         with params.to_module(self.actor_network, preserve_module_state=False):
             yield self.actor_network.module  # type: ignore[misc]
 
     @contextmanager
-    def _critics(self, kind: Literal["online", "frozen", "target"] = "online") -> Iterator[Critic]:
-        """The critic module on the stacked parameters of all critics, so that one call gives (critics, N, 1).
-
-        Args:
-            kind: "online" parameters take gradients, "frozen" ones are the same without gradients, and "target" ones
-                are the Polyak averages.
-        """
-        if kind == "target":
-            params = self.target_qvalue_network_params
-        else:
-            params = self.qvalue_network_params if kind == "online" else self.qvalue_network_params.data
+    def _critics(self, params: TensorDictBase) -> Iterator[Critic]:
+        """The critic module on stacked parameters of all critics, so that one call gives (critics, N, 1)."""
         with params.to_module(self.qvalue_network, preserve_module_state=False):
             yield self.qvalue_network.module  # type: ignore[misc]
 
-    def _residuals(self, tau: Tensor, x: Tensor, action: Tensor, u: Tensor, probes: Tensor | None = None) -> Tensor:
-        """L^u Q_i(., action) (critics, N): tau (N,), x (N, n), the critics' frozen action and the physical u (N, m).
+    def _target_action(self, networks: Networks, points: TensorDictBase) -> Tensor:
+        """The output (N, m) in [-1, 1] of the target actor, without a gradient."""
+        with torch.no_grad(), self._actor(networks.target_actor) as actor:
+            return actor(points["tau"], points["state"])
+
+    def _residuals(
+        self, networks: Networks, points: TensorDictBase, action: Tensor, probes: Tensor | None = None
+    ) -> Tensor:
+        """L^u Q_i(., action) (critics, N), with the critics' action (N, m) frozen and u = action in physical units.
 
         With probes (k, N, w) there are k estimates of each, (critics, k, N).
         """
-        with self._critics() as critic:
+        tau, x, u = points["tau"].squeeze(-1), points["state"], self.problem.controls.denormalize(action)
+        with self._critics(networks.critic) as critic:
             return generator(critic.at(action), self.problem, tau, x, u, probes)
 
-    def _td_loss(self, replay: TensorDictBase, noise: Tensor) -> Tensor:
+    def _td_loss(self, networks: Networks, replay: TensorDictBase, noise: TensorDictBase) -> Tensor:
         """L_TD summed over critics: (Q_i - r - (1 - d) min_j Q_j^-(y', pi^-(y') + noise))^2."""
-        tau, x = replay["next", "tau"], replay["next", "state"]
-        with torch.no_grad():
-            action = (self._act(tau, x, target=True) + noise).clamp(-1, 1)
-            with self._critics("target") as critic:
-                values = critic(tau, x, action)
-                value = values.amin(0) if self.target_critics == "min" else values.mean(0)
-            target = replay["next", "reward"] + (~replay["next", "terminated"]) * value
+        following: TensorDictBase = replay.get("next")
+        action = self._target_action(networks, following)
+        if self.policy_noise:
+            action = (action + noise["smoothing"]).clamp(-1, 1)
+        with torch.no_grad(), self._critics(networks.target_critic) as critic:
+            values = critic(following["tau"], following["state"], action)
+            value = values.amin(0) if self.target_critics == "min" else values.mean(0)
+            target = following["reward"] + (~following["terminated"]) * value
         inputs = replay["tau"], replay["state"], replay["action"]
-        with self._critics() as critic:
+        with self._critics(networks.critic) as critic:
             if self.td_criterion == "squares":
                 error = (critic(*inputs) - target).square()
             else:
@@ -257,21 +308,20 @@ class PIRLLoss(ScheduledTD3Loss):
                 error = error + LOGIT_WEIGHT * (logits.abs() - LARGEST_LOGIT).clamp(min=0).square()
         return error.squeeze(-1).sum(0).mean()
 
-    def _hjb_loss(self, points: TensorDictBase) -> Tensor:
+    def _hjb_loss(self, networks: Networks, points: TensorDictBase, noise: TensorDictBase) -> Tensor:
         """L_PDE summed over critics: the mean of (L^u Q_i)^2 over unmasked points, u = pi^-(y) + noise."""
-        with torch.no_grad():
-            action = self._act(points["tau"], points["state"], target=True)
-            if self.hjb_noise:
-                action = (action + self._clipped_noise(action, self.hjb_noise, self.hjb_noise_clip)).clamp(-1, 1)
-            u = self.problem.controls.denormalize(action)
-        inputs = points["tau"].squeeze(-1), points["state"], action, u
+        action = self._target_action(networks, points)
+        if self.hjb_noise:
+            action = (action + noise["control"]).clamp(-1, 1)
         if self.hjb_probes:
-            squares = self._estimated_squares(*inputs)
+            squares = self._estimated_squares(networks, points, action, noise)
         else:
-            squares = _huber(self._residuals(*inputs), self.hjb_delta)
+            squares = _huber(self._residuals(networks, points, action), self.hjb_delta)
         return masked_mean(squares.sum(0), points["mask"])
 
-    def _estimated_squares(self, tau: Tensor, x: Tensor, action: Tensor, u: Tensor) -> Tensor:
+    def _estimated_squares(
+        self, networks: Networks, points: TensorDictBase, action: Tensor, noise: TensorDictBase
+    ) -> Tensor:
         """Unbiased estimates (critics, N) of r^2 for the residuals r of `_residuals`, from k independent probes.
 
         The square of the mean of the k estimates of r has the mean r^2 + Var/k, from which the sample variance over k
@@ -282,27 +332,26 @@ class PIRLLoss(ScheduledTD3Loss):
         gradient is that of r^2 times the weight E H'(r_0^2), which is at most 1 and falls with r. If r_0 came from the
         same probes, the loss would fall as the variance of the estimates grows.
         """
-        probes = self.hjb_probes, x, self.channels
-        estimates = self._residuals(tau, x, action, u, rademacher(*probes))
+        estimates = self._residuals(networks, points, action, noise["probes"])
         square = estimates.mean(-2).square() - estimates.var(-2) / self.hjb_probes
         if self.hjb_delta is None:
             return square
         with torch.no_grad():
-            size = self._residuals(tau, x, action, u, rademacher(*probes)).square().mean(-2).sqrt()
+            of_size = self._residuals(networks, points, action, noise["probes_of_size"])
+            size = of_size.square().mean(-2).sqrt()
         slope = (self.hjb_delta / size).clamp(max=1)
         return _huber(size, self.hjb_delta) + slope * (square - size.square())
 
-    def _boundary_loss(self, points: TensorDictBase) -> Tensor:
+    def _boundary_loss(self, networks: Networks, points: TensorDictBase) -> Tensor:
         """L_BC summed over critics: the mean of w (Q_i(y, pi^-(y)) - l_eps)^2 with the weights w of the points."""
-        with torch.no_grad():
-            action = self._act(points["tau"], points["state"], target=True)
-        with self._critics() as critic:
+        action = self._target_action(networks, points)
+        with self._critics(networks.critic) as critic:
             value = critic(points["tau"], points["state"], action).squeeze(-1)
         return (points["weight"] * _huber(value - points["value"], self.boundary_delta).sum(0)).mean()
 
-    @staticmethod
-    def _clipped_noise(like: Tensor, deviation: float, bound: float) -> Tensor:
-        return (torch.randn_like(like) * deviation).clamp(-bound, bound)
+
+def _clipped_noise(like: Tensor, deviation: float, bound: float) -> Tensor:
+    return (torch.randn_like(like) * deviation).clamp(-bound, bound)
 
 
 def _huber(residual: Tensor, delta: float | None) -> Tensor:

@@ -36,12 +36,17 @@ class Solution:
     @property
     def dtype(self) -> torch.dtype:
         """The dtype of the networks."""
-        return next(self.actor.parameters()).dtype
+        return self._weight.dtype
 
     @property
     def device(self) -> torch.device:
         """The device of the networks."""
-        return next(self.actor.parameters()).device
+        return self._weight.device
+
+    @property
+    def _weight(self) -> Tensor:
+        # In a loss of a population the weights are no parameters but tensors that `torch.func.vmap` has wrapped.
+        return self.actor.layers[-2].weight  # type: ignore[return-value]
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All numbers that the policy and V are computed from, by name."""

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from tensordict import TensorDict
 from torch import Tensor
 
 from pirl_rl import checkpoint
@@ -25,7 +26,7 @@ from pirl_rl.run_directory import RunDirectory
 from pirl_rl.sampling.batches import BatchSampler
 from pirl_rl.sampling.boundary import BoundarySampler
 from pirl_rl.sampling.collocation import Collocation
-from pirl_rl.schedules import WEIGHTS, Schedule
+from pirl_rl.schedules import WEIGHTS, Schedule, Weights
 from pirl_rl.simulator import Simulator
 
 
@@ -96,7 +97,7 @@ class Trainer:
                 raise ArgumentError(f"trainer.{name}: expected an integer >= {least}, got {value!r}")
         if not checkpoint_seconds >= 0:
             raise ArgumentError(f"trainer.checkpoint_seconds: expected a number >= 0, got {checkpoint_seconds!r}")
-        self.checkpoint_seconds, self._saved_at = checkpoint_seconds, 0.0
+        self.checkpoint_seconds = checkpoint_seconds
         self.learner, self.collector = learner, collector
         self.curriculum = Curriculum(schedule, updates, stages or (Stage(),))
         self._run_settings = StageSettings(
@@ -133,6 +134,7 @@ class Trainer:
         if rollback:
             self.rollback = Rollback.of(learner, self.during, self.simulator, evaluate_every)
         self.update, self.saved, self.wall_seconds = 0, 0, 0.0
+        self._started = self._saved_at = 0.0
 
     def train(self) -> dict[str, float]:
         """Train to the last update and evaluate; returns the summary.
@@ -141,60 +143,97 @@ class Trainer:
             DivergenceError: a loss exploded; the last checkpoint is from before.
             Interrupted: on SIGINT, after a checkpoint.
         """
+        self.open()
+        try:
+            if not self.ended:
+                with interruptible() as interrupted:
+                    self.begin()
+                    announce("compiling the losses, and training" if self.learner.compile else "training")
+                    self._loop(interrupted)
+        except DivergenceError as error:
+            self.recover(error)
+        finally:
+            self.close()
+        return self.finish()
+
+    def _loop(self, interrupted: Callable[[], bool]) -> None:
+        with Progress(self.updates, self.update) as progress:
+            for k in range(self.update, self.updates):
+                batch, weights, decay = self.draw(k)
+                terms = self.learner.update(batch, k, weights, decay)
+                progress.show(k + 1, self.record(k, terms))
+                stop = interrupted() and self.update < self.updates
+                self.keep(stop)
+                if stop:
+                    raise Interrupted(self.update)
+
+    # The methods from here to `finish` are the parts of `train`, which `Population` calls for each of its members.
+
+    @property
+    def ended(self) -> bool:
+        """Whether all updates are made, or a collapse has ended training before."""
+        return self.update == self.updates or (self.rollback is not None and self.rollback.collapsed_at is not None)
+
+    def open(self) -> None:
+        """Open the log."""
         if self.folder is not None:
             self.logger.open(self.folder, self.config)
             self.logger.rewind(self.update)
-        try:
-            if self.rollback is None or self.rollback.collapsed_at is None:
-                self._run()
-        except DivergenceError as error:
+
+    def begin(self) -> None:
+        """Prepare the first update: enter its stage, judge the networks as they are, and play the warm-up."""
+        self._enter_stage()
+        if self.rollback is not None and self.rollback.good_at is None:
+            self.rollback.judge(self.update)
+        announce("playing the first transitions")
+        self.collector.start()
+        self._started, self._saved_at = time.perf_counter() - self.wall_seconds, time.perf_counter()
+
+    def draw(self, k: int) -> tuple[TensorDict, Weights, float]:
+        """Collect what is due before update `k`; returns its batch, its loss weights and the decay of its rate."""
+        if self.curriculum.is_first(k):
+            self._enter_stage()
+        self.collector.step(k)
+        weights = self.curriculum.weights(k)
+        return self.batches.sample(weights, self.curriculum.progress(k)), weights, self.curriculum.decay(k)
+
+    def record(self, k: int, terms: Mapping[str, Tensor]) -> dict[str, float]:
+        """Count update `k`, log its row of metrics and judge it; returns the row, which may be empty.
+
+        Raises:
+            CollapseError: training has collapsed, see `Guard`.
+        """
+        self.update, self.wall_seconds = k + 1, time.perf_counter() - self._started
+        row = self._row(k, terms)
+        if row:
+            self.logger.log(row)
+        if self.rollback is not None and ("success_rate" in row or self.update == self.updates):
+            self.rollback.judge(self.update, row)
+        return row
+
+    def keep(self, stop: bool) -> None:
+        """Write a checkpoint if one is due, or if training is about to `stop`."""
+        due = bool(self.checkpoint_every) and self.update % self.checkpoint_every == 0
+        late = 0 < self.checkpoint_seconds <= time.perf_counter() - self._saved_at
+        if due or late or stop or self.update == self.updates:
+            self.save(keep_weights=due and self.update < self.updates)
+
+    def recover(self, error: DivergenceError) -> None:
+        """End a training that has diverged with the networks of its last good evaluation.
+
+        Raises:
+            DivergenceError: there is no rollback; the message says which checkpoint there is.
+        """
+        if self.rollback is None or self.rollback.good_at is None:
             kept = f"the checkpoint of update {self.saved} is kept" if self.saved else "there is no checkpoint yet"
             raise DivergenceError(f"{error}; {kept}") from None
-        finally:
-            self.collector.close()
-            self.logger.close()
-        return self._finish()
+        self.rollback.restore(self.update, str(error))
+        self.save()
 
-    def _run(self) -> None:
-        with interruptible() as interrupted:
-            self._enter_stage()
-            if self.rollback is not None and self.rollback.good_at is None:
-                self.rollback.judge(self.update)
-            announce("playing the first transitions")
-            self.collector.start()
-            announce("compiling the losses, and training" if self.learner.compile else "training")
-            try:
-                self._loop(interrupted)
-            except DivergenceError as error:
-                if self.rollback is None:
-                    raise
-                self.rollback.restore(self.update, str(error))
-                self.save()
-
-    def _loop(self, interrupted: Callable[[], bool]) -> None:
-        started, self._saved_at = time.perf_counter() - self.wall_seconds, time.perf_counter()
-        with Progress(self.updates, self.update) as progress:
-            for k in range(self.update, self.updates):
-                if self.curriculum.is_first(k):
-                    self._enter_stage()
-                self.collector.step(k)
-                weights, decay = self.curriculum.weights(k), self.curriculum.decay(k)
-                batch = self.batches.sample(weights, self.curriculum.progress(k))
-                terms = self.learner.update(batch, k, weights, decay)
-                self.update, self.wall_seconds = k + 1, time.perf_counter() - started
-                row = self._row(k, terms)
-                if row:
-                    self.logger.log(row)
-                progress.show(self.update, row)
-                if self.rollback is not None and ("success_rate" in row or self.update == self.updates):
-                    self.rollback.judge(self.update, row)
-                stop = interrupted() and self.update < self.updates
-                due = bool(self.checkpoint_every) and self.update % self.checkpoint_every == 0
-                late = 0 < self.checkpoint_seconds <= time.perf_counter() - self._saved_at
-                if due or late or stop or self.update == self.updates:
-                    self.save(keep_weights=due and self.update < self.updates)
-                if stop:
-                    raise Interrupted(self.update)
+    def close(self) -> None:
+        """Stop playing, and close the log."""
+        self.collector.close()
+        self.logger.close()
 
     def _enter_stage(self) -> None:
         """Take over what the stage of the next update sets, and the run's own for the rest."""
@@ -218,7 +257,8 @@ class Trainer:
             row |= metrics_of(evaluate(self.solution, self.simulator, self.during))
         return row
 
-    def _finish(self) -> dict[str, float]:
+    def finish(self) -> dict[str, float]:
+        """Evaluate, and write the summary; returns it."""
         if self.final:
             announce(f"measuring: {', '.join(self.final)}")
         self.evidence = evaluate(self.solution, self.simulator, self.final)

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from small import small_trainer
 
 
@@ -15,6 +16,14 @@ def trained(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("trained")
     small_trainer(folder, "trainer.updates=20").train()
     return folder
+
+
+@pytest.fixture
+def float64():
+    """Double precision by default."""
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
 
 
 @pytest.fixture

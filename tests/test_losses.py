@@ -26,13 +26,6 @@ RELATIVE = 1e-10
 some_problems = pytest.mark.parametrize("problem", [Reach1D(), FullNoise(8, 2, 3)], ids=name)
 
 
-@pytest.fixture
-def float64():
-    torch.set_default_dtype(torch.float64)
-    yield
-    torch.set_default_dtype(torch.float32)
-
-
 def networks(problem, critics: int = 2):
     torch.manual_seed(3)
     nets = [Actor(problem, (8, 8), "Tanh"), *(Critic(problem, (9, 7), action_input=True) for _ in range(critics))]
@@ -169,7 +162,6 @@ def test_hjb_alone_by_hand(problem, hjb_noise):
     inside, (actor, _) = batch["collocation"], target_networks(problem)
     action = actor(inside["tau"], inside["state"]).detach()
     torch.manual_seed(11)
-    torch.randn_like(batch["replay"]["action"])  # the smoothing of the TD target comes first
     action = (action + (hjb_noise * torch.randn_like(action)).clamp(-0.5, 0.5)).clamp(-1, 1)[inside["mask"]]
     kept = inside[inside["mask"]]
     _, critics = networks(problem)

@@ -20,10 +20,8 @@ Examples:
 
 from __future__ import annotations
 
-import contextlib
-import shutil
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import hydra
@@ -35,22 +33,19 @@ from pirl_rl.assembly import make_problem, make_trainer
 from pirl_rl.commands.catalogue import choices
 from pirl_rl.commands.check import check_before_training
 from pirl_rl.commands.composition import check_overrides, drop_leftovers, register
-from pirl_rl.commands.console import named_modules, outcome, override, quiet_libraries, reported
-from pirl_rl.commands.methods import check_method, method_of
-from pirl_rl.commands.report import draw_again
+from pirl_rl.commands.console import named_modules, override, quiet_libraries, reported
+from pirl_rl.commands.directory import new_directory, refuse_files, show, take_start
+from pirl_rl.commands.methods import check_method
+from pirl_rl.commands.population import resume_population, train_population
 from pirl_rl.commands.solve import solve
 from pirl_rl.configuration import CONF, PACKAGE, load_config, save_config
-from pirl_rl.continuation import restore, start_from
-from pirl_rl.errors import INTERRUPTED, CheckpointError, ConfigError
-from pirl_rl.evaluation import lines_of, meanings_of
-from pirl_rl.figures import draw_run
+from pirl_rl.continuation import restore
+from pirl_rl.errors import INTERRUPTED, ConfigError
 from pirl_rl.lock import locked
 from pirl_rl.machine import record_session
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.progress import announce, helped
-from pirl_rl.reports.meanings import TRAINING
 from pirl_rl.run_directory import RunDirectory
-from pirl_rl.trainer import Trainer
 
 NOTHING_NAMED = """error: nothing to train was named, expected one of
   python -m pirl_rl.train +experiment=own env.problem._target_=my_module.MyProblem
@@ -113,7 +108,7 @@ def train_new(
     Raises:
         PirlError: if the configuration cannot be built, or training diverges or is interrupted.
     """
-    with _new(folder):
+    with new_directory(folder):
         # Modules that the user names are trusted; those that a run directory names are not, since it may be foreign.
         check_method(config, overrides)
         trust = [*config.trust, *named_modules(overrides), *trust]
@@ -122,16 +117,20 @@ def train_new(
         if config.check:
             announce("checking the problem")
             check_before_training(config, problem)
+        if config.trainer.get("seeds") is not None:
+            return train_population(config, folder, overrides, trust, problem)
         if config.grid is not None:
             return solve(config, folder, overrides, trust, problem)
         trainer = make_trainer(config, folder, trust, problem)
         if config.start is not None:
-            _start(trainer, config)
+            take_start(trainer, config)
         # The configuration comes last: a directory with it counts as begun, and must tell its overrides.
         OmegaConf.save(overrides, RunDirectory(folder).overrides)
         save_config(config, folder)
         record_session(RunDirectory(folder), overrides, trainer.solution.device)
-        return _train(trainer, config, trust)
+        summary = trainer.train()
+        show(trainer, summary, config, trust)
+        return summary
 
 
 def resume(folder: Path, overrides: Sequence[str]) -> None:
@@ -156,6 +155,8 @@ def go_on(folder: Path, overrides: Sequence[str], trust: Sequence[str] = ()) -> 
     run.refuse_links()
     with locked(run):
         config.trust = []
+        if config.trainer.get("seeds") is not None:
+            return resume_population(config, folder, overrides, [*named_modules(overrides), *trust])
         for text in overrides:
             if text.startswith("start="):
                 raise ConfigError(f"{text}: the run has begun already; start= is for new runs, without resume=")
@@ -171,88 +172,18 @@ def go_on(folder: Path, overrides: Sequence[str], trust: Sequence[str] = ()) -> 
         else:
             print("resume: the run has no checkpoint yet and starts again at update 0", flush=True)
             if config.get("start") is not None:
-                _start(trainer, config)
+                take_start(trainer, config)
         save_config(config, folder)
         record_session(run, [f"resume={folder.name}", *overrides], trainer.solution.device)
-        return _train(trainer, config, modules)
-
-
-def _start(trainer: Trainer, config: DictConfig) -> None:
-    """Take the networks of another run, and record the file in the configuration.
-
-    The absolute path of the file is recorded: the given path may be relative, or that of a run directory whose newest
-    checkpoint changes when the run is resumed.
-
-    Raises:
-        ConfigError: if `start` is no path.
-        CheckpointError: if the networks do not fit; the message names the method of the other run where it differs.
-    """
-    start = config.start
-    if not isinstance(start, str):
-        raise ConfigError(f"start: expected the path of a run or a checkpoint, got {start!r}")
-    try:
-        config.start = str(start_from(trainer, start))
-    except CheckpointError as error:
-        method = method_of(start)
-        if method in (None, config.method_name):
-            raise
-        raise CheckpointError(
-            f"{error}; that run had method={method} and this one has method={config.method_name}, whose networks may "
-            f"differ: give method={method}, or start from a run with method={config.method_name}"
-        ) from None
-
-
-def _train(trainer: Trainer, config: DictConfig, trust: Sequence[str]) -> dict[str, float]:
-    summary = trainer.train()
-    assert trainer.folder is not None
-    run = RunDirectory(trainer.folder)
-    meanings = {"training": TRAINING} | meanings_of(trainer.final, trainer.solution.problem)
-    print(outcome(lines_of(trainer.evidence), summary, meanings, config.get("verbose", False)))
-    for figure in draw_run(trainer.solution, run.metrics, run.figures, trainer.evidence):
-        print(f"figure   {figure}")
-    if config.get("report", True):
-        draw_again(run.path, trust, trainer.solution.problem)
-    print(f"run      {run}")
-    return summary
-
-
-@contextlib.contextmanager
-def _new(folder: Path) -> Iterator[None]:
-    """Create a run directory. It is removed if the run ends before its first row of metrics, checkpoint or grid.
-
-    Raises:
-        ConfigError: if the directory is not empty, or a file lies in its place.
-        RunError: if another process has just begun a run there.
-    """
-    _refuse_files(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    run = RunDirectory(folder)
-    if not run.unused():
-        raise ConfigError(
-            f"hydra.run.dir: expected an empty directory, but {folder} is not empty, and no run overwrites files"
-        )
-    with locked(run):
-        try:
-            yield
-        except BaseException:
-            if not any(path.exists() for path in (run.metrics, run.checkpoints, run.grid)):
-                shutil.rmtree(folder)
-                for parent in (folder.parent, folder.parent.parent):
-                    with contextlib.suppress(OSError):
-                        parent.rmdir()  # fails for a folder that is not empty
-            raise
+        summary = trainer.train()
+        show(trainer, summary, config, modules)
+        return summary
 
 
 def _folders(arguments: Sequence[str]) -> list[Path]:
     """The run directories that overrides name, which Hydra creates before it calls `train`."""
     named = (text.partition("=") for text in arguments)
     return [Path(path) for key, _, path in named if key in ("hydra.run.dir", "hydra.sweep.dir")]
-
-
-def _refuse_files(folder: Path) -> None:
-    for path in (folder, *folder.parents):
-        if path.exists() and not path.is_dir():
-            raise ConfigError(f"hydra.run.dir: expected a directory, but {path} is a file")
 
 
 def main() -> None:
@@ -272,7 +203,7 @@ def main() -> None:
             with reported(Path()):
                 check_overrides(arguments)
                 for folder in _folders(arguments):
-                    _refuse_files(folder)
+                    refuse_files(folder)
             register()
             train()
     except KeyboardInterrupt:

@@ -86,14 +86,17 @@ class Sweep(NamedTuple):
 
 
 def find_jobs(folder: Path) -> list[SweepJob]:
-    """All runs below the directory of a sweep.
+    """All runs below the directory of a sweep or of a population.
 
     Raises:
         RunError: if there is no run, or one cannot be read.
     """
     jobs = []
-    for path in sorted(folder.rglob(str(RunDirectory.OVERRIDES))):
+    paths = sorted(folder.rglob(str(RunDirectory.OVERRIDES)))
+    for path in paths:
         run = RunDirectory(path.parents[1])
+        if any(run.path in other.parents[2:] for other in paths):
+            continue  # a population, whose members are the runs
         try:
             typed = OmegaConf.to_container(OmegaConf.load(path))
         except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException) as error:

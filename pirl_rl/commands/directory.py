@@ -1,0 +1,99 @@
+"""The run directory of a training: how it is created, what it starts from, and what is shown of it at the end."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from pirl_rl.commands.console import outcome
+from pirl_rl.commands.methods import method_of
+from pirl_rl.commands.report import draw_again
+from pirl_rl.continuation import start_from
+from pirl_rl.errors import CheckpointError, ConfigError
+from pirl_rl.evaluation import lines_of, meanings_of
+from pirl_rl.figures import draw_run
+from pirl_rl.lock import locked
+from pirl_rl.reports.meanings import TRAINING
+from pirl_rl.run_directory import RunDirectory
+from pirl_rl.trainer import Trainer
+
+
+def take_start(trainer: Trainer, config: DictConfig) -> None:
+    """Take the networks of another run, and record the file in the configuration.
+
+    The absolute path of the file is recorded: the given path may be relative, or that of a run directory whose newest
+    checkpoint changes when the run is resumed.
+
+    Raises:
+        ConfigError: if `start` is no path.
+        CheckpointError: if the networks do not fit; the message names the method of the other run where it differs.
+    """
+    start = config.start
+    if not isinstance(start, str):
+        raise ConfigError(f"start: expected the path of a run or a checkpoint, got {start!r}")
+    try:
+        config.start = str(start_from(trainer, start))
+    except CheckpointError as error:
+        method = method_of(start)
+        if method in (None, config.method_name):
+            raise
+        raise CheckpointError(
+            f"{error}; that run had method={method} and this one has method={config.method_name}, whose networks may "
+            f"differ: give method={method}, or start from a run with method={config.method_name}"
+        ) from None
+
+
+def show(trainer: Trainer, summary: Mapping[str, float], config: DictConfig, trust: Sequence[str]) -> None:
+    """Print what a training has come to, and draw its figures and its report."""
+    assert trainer.folder is not None
+    run = RunDirectory(trainer.folder)
+    meanings = {"training": TRAINING} | meanings_of(trainer.final, trainer.solution.problem)
+    print(outcome(lines_of(trainer.evidence), summary, meanings, config.get("verbose", False)))
+    for figure in draw_run(trainer.solution, run.metrics, run.figures, trainer.evidence):
+        print(f"figure   {figure}")
+    if config.get("report", True):
+        draw_again(run.path, trust, trainer.solution.problem)
+    print(f"run      {run}")
+
+
+@contextlib.contextmanager
+def new_directory(folder: Path) -> Iterator[None]:
+    """Create a run directory. It is removed if the run ends before its first row of metrics, checkpoint or grid.
+
+    Raises:
+        ConfigError: if the directory is not empty, or a file lies in its place.
+        RunError: if another process has just begun a run there.
+    """
+    refuse_files(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    run = RunDirectory(folder)
+    if not run.unused():
+        raise ConfigError(
+            f"hydra.run.dir: expected an empty directory, but {folder} is not empty, and no run overwrites files"
+        )
+    with locked(run):
+        try:
+            yield
+        except BaseException:
+            members = any(RunDirectory(path).config.exists() for path in folder.iterdir())
+            if not members and not any(path.exists() for path in (run.metrics, run.checkpoints, run.grid)):
+                shutil.rmtree(folder)
+                for parent in (folder.parent, folder.parent.parent):
+                    with contextlib.suppress(OSError):
+                        parent.rmdir()  # fails for a folder that is not empty
+            raise
+
+
+def refuse_files(folder: Path) -> None:
+    """Refuse a path of a directory on which there is a file.
+
+    Raises:
+        ConfigError: with the file.
+    """
+    for path in (folder, *folder.parents):
+        if path.exists() and not path.is_dir():
+            raise ConfigError(f"hydra.run.dir: expected a directory, but {path} is a file")

@@ -1,0 +1,246 @@
+"""A population: trainings of one problem side by side, with the losses of all members evaluated by one program.
+
+The members differ in their seeds, in their loss weights or in their learning rates. Each is a whole `Trainer`, with an
+environment, a replay buffer, optimisers, random numbers and a run directory of its own, so that its run equals the one
+that it would have alone, up to rounding. An update stacks the networks and the batches of all members along a leading
+axis, and `torch.func.vmap` maps the losses over that axis. Everything is compiled once for all members, and their
+matrix products are made together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from pirl_rl import checkpoint
+from pirl_rl.compilation import Compiled
+from pirl_rl.errors import ArgumentError, DivergenceError, Interrupted
+from pirl_rl.learner import Gradient, Terms
+from pirl_rl.losses import TERMS, Networks, PIRLLoss
+from pirl_rl.progress import Progress, announce, interruptible
+from pirl_rl.trainer import Trainer
+
+PARTS: dict[str, Any] = dict(zip(TERMS, (("replay", "next"), "collocation", "boundary"), strict=True))
+"""The part of a batch that each term of the critic loss needs."""
+
+Trained = Literal["critic", "actor"]
+"""The network whose loss is meant."""
+
+
+class Population:
+    """Trains several trainers side by side.
+
+    Attributes:
+        errors: the errors by which trainings have ended, by the index of the member. The others go on.
+
+    Args:
+        members: the trainers, of one problem with the same networks, stages and number of updates.
+        numbers: for each member the states of torch's random generators with which its training begins, see
+            `pirl_rl.checkpoint.global_rng_states`.
+
+    Raises:
+        ArgumentError: there is no member, or the numbers of updates or the shapes of the networks differ.
+    """
+
+    def __init__(self, members: Sequence[Trainer], numbers: Sequence[dict[str, Any]]):
+        kinds = {(one.updates, *(str(entry.shape) for entry in one.learner.loss.parameters())) for one in members}
+        if len(kinds) != 1:
+            raise ArgumentError("population: expected members with the same updates and networks of the same shapes")
+        self.members, self._numbers = members, list(numbers)
+        self.errors: dict[int, DivergenceError] = {}
+        self._losses = StackedLosses(members[0].learner.compile)
+
+    def train(self) -> list[dict[str, float] | None]:
+        """Train all members to the last update and evaluate them.
+
+        Returns:
+            The summary of each member, or None if `errors` has one of it.
+
+        Raises:
+            Interrupted: on SIGINT, after a checkpoint of each member.
+        """
+        try:
+            with interruptible() as interrupted:
+                for index, member in enumerate(self.members):
+                    with self._as_alone(index):
+                        member.open()
+                        if not member.ended:
+                            member.begin()
+                announce("training")
+                self._loop(interrupted)
+        finally:
+            for member in self.members:
+                member.close()
+        summaries: list[dict[str, float] | None] = [None] * len(self.members)
+        for index, member in enumerate(self.members):
+            if index not in self.errors:
+                with self._as_alone(index):
+                    summaries[index] = member.finish()
+        return summaries
+
+    def _loop(self, interrupted: Callable[[], bool]) -> None:
+        updates = self.members[0].updates
+        # A population that was killed may have members with checkpoints of different updates.
+        first = min((self.members[index].update for index in self._active()), default=updates)
+        with Progress(updates, first) as progress:
+            for k in range(first, updates):
+                rows = self._update(k)
+                names = min(rows, key=len, default={})
+                progress.show(k + 1, {name: sum(row[name] for row in rows) / len(rows) for name in names})
+                stopped = self._active() if interrupted() else []
+                for index in stopped:
+                    with self._as_alone(index):
+                        self.members[index].keep(stop=True)
+                if stopped:
+                    raise Interrupted(k + 1)
+
+    def _update(self, k: int) -> list[dict[str, float]]:
+        """Make update `k` of all members that have come to it; returns their rows of metrics."""
+        due = [index for index in self._active() if self.members[index].update == k]
+        learners = [self.members[index].learner for index in due]
+        losses = [learner.loss for learner in learners]
+        batches = [self._draw(index, k) for index in due]
+        batch: TensorDictBase = TensorDict.stack(_completed(batches))  # pyright: ignore[reportAssignmentType]
+        terms: dict[int, Terms] = {}
+        for index, gradient in zip(due, self._losses("critic", losses, batch), strict=True):
+            with self._ending(index):
+                terms[index] = self.members[index].learner.step_critics(gradient, k)
+        if k % learners[0].actor_every == 0:
+            # Rules of the actor take a batch with collocation points in another way than one without.
+            within = ["collocation" in own.keys() for own in batches]
+            kinds = {True: batch, False: batch.exclude("collocation")} if learners[0].train_actor else {}
+            gradients = {kind: self._losses("actor", losses, kinds[kind]) for kind in kinds if kind in within}
+            for i, (index, learner) in enumerate(zip(due, learners, strict=True)):
+                with self._ending(index):
+                    if index in terms and gradients:
+                        learner.step_actor(gradients[within[i]][i], k)
+                    if index in terms:
+                        learner.targets.step()
+        rows = []
+        for index, learner, own in zip(due, learners, batches, strict=True):
+            if index in self._active():
+                found = {name: value for name, value in terms[index].items() if PARTS[name] in own.keys(True)}
+                with self._as_alone(index):
+                    rows.append(self.members[index].record(k, found | {"loss_actor": learner.loss_actor}))
+                    self.members[index].keep(stop=False)
+        return rows
+
+    def _draw(self, index: int, k: int) -> TensorDictBase:
+        """Prepare update `k` of a member; returns its batch with the random numbers of its losses."""
+        member = self.members[index]
+        with self._as_alone(index):
+            batch, weights, decay = member.draw(k)
+            batch = member.learner.loss.with_noise(batch)
+        # A term for which this member has no part of a batch has the weight 0, see `_completed`.
+        td, hjb, boundary = (
+            w if part in batch.keys(True) else 0.0 for w, part in zip(weights, PARTS.values(), strict=True)
+        )
+        member.learner.prepare((td, hjb, boundary), decay)
+        return batch
+
+    def _active(self) -> list[int]:
+        """The members whose training goes on."""
+        return [i for i, member in enumerate(self.members) if not member.ended and i not in self.errors]
+
+    @contextmanager
+    def _ending(self, index: int) -> Iterator[None]:
+        """End the training of a member alone if it diverges."""
+        try:
+            yield
+        except DivergenceError as error:
+            try:
+                self.members[index].recover(error)
+            except DivergenceError as last:
+                self.errors[index] = last
+
+    @contextmanager
+    def _as_alone(self, index: int) -> Iterator[None]:
+        """Draw the random numbers that the member would draw if it were trained alone."""
+        checkpoint.restore_global_rngs(self._numbers[index])
+        with self._ending(index):
+            yield
+        self._numbers[index] = checkpoint.global_rng_states()
+
+
+class StackedLosses:
+    """The losses of several members with the same networks and options, in one program.
+
+    Args:
+        compile: whether the program is compiled.
+    """
+
+    def __init__(self, compile: bool):
+        self.compile = compile
+        self._programs: dict[str, tuple[Any, Callable[[Networks, TensorDictBase], Gradient]]] = {}
+
+    def __call__(self, which: Trained, losses: Sequence[PIRLLoss], batch: TensorDictBase) -> list[Gradient]:
+        """The loss of the critics or of the actor of each member, with its terms and its gradient.
+
+        Args:
+            which: "critic" or "actor".
+            losses: the loss of each of the M members.
+            batch: the stacked batches of the members, (M,).
+
+        Raises:
+            ArgumentError: `torch.func.vmap` cannot map a function of the problem.
+        """
+        # The loss of one member, with the actor rule of its stage, is evaluated on the networks of all.
+        key = losses[0], losses[0].actor_rule
+        if which not in self._programs or self._programs[which][0] != key:
+            self._programs[which] = key, self._program(which, losses[0])
+        try:
+            loss, terms, gradient = self._programs[which][1](_stacked([one.networks for one in losses]), batch)
+        except RuntimeError as error:
+            if "vmap" not in str(error):
+                raise
+            raise ArgumentError(
+                "trainer.seeds: a function of the problem cannot be evaluated for several members at once "
+                f"({str(error).partition(chr(10))[0]}); train them one after another with -m seed=0,1"
+            ) from error
+        own = ({name: values[index] for name, values in terms.items()} for index in range(len(losses)))
+        return list(zip(loss, own, zip(*gradient, strict=True), strict=True))  # type: ignore[arg-type]
+
+    def _program(self, which: Trained, loss: PIRLLoss) -> Callable[[Networks, TensorDictBase], Gradient]:
+        if which == "actor":
+            # What a rule compiles by itself could not be mapped over the members.
+            loss.actor_rule.compile(lambda inner: inner)
+        function, params = loss.critic_loss, loss.qvalue_network_params
+        if which == "actor":
+            function, params = loss.actor_loss, loss.actor_network_params
+        keys = [tuple(name.split(".")) for name, _ in params.named_parameters()]
+
+        def program(networks: Networks, batch: TensorDictBase) -> Gradient:
+            trained = networks.critic if which == "critic" else networks.actor
+            entries = [trained[key] for key in keys]
+            found, terms = torch.func.vmap(lambda own, part: function(part, own))(networks, batch)
+            # A member's loss depends on its own parameters alone, so that the sum has the gradients of all.
+            return found.detach(), terms, torch.autograd.grad(found.sum(), entries, allow_unused=True)
+
+        whole = which == "critic" or loss.actor_rule.compiles_whole
+        return Compiled(program, f"the loss of the {which}s") if self.compile and whole else program
+
+
+def _stacked(networks: Sequence[Networks]) -> Networks:
+    """The networks with a leading axis over the members; critics and actors take gradients."""
+    *params, weights = zip(*networks, strict=True)
+    critic, actor, target_critic, target_actor = (TensorDict.stack([one.data for one in own]) for own in params)
+    stacked = [torch.stack(entries) for entries in zip(*weights, strict=True)]
+    return Networks(critic.requires_grad_(), actor.requires_grad_(), target_critic, target_actor, stacked)
+
+
+def _completed(batches: Sequence[TensorDictBase]) -> list[TensorDictBase]:
+    """The batches, where a part that only some members have is copied to the others, so that all can be stacked.
+
+    Its term has the weight 0 for the others, so that their gradients stay as they are.
+    """
+    completed = [batch.copy() for batch in batches]
+    for part in PARTS.values():
+        owners = [batch for batch in completed if part in batch.keys(True)]
+        for batch in completed:
+            if owners and part not in batch.keys(True):
+                batch[part] = owners[0][part]
+    return completed
