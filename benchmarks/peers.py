@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import statistics
 import time
 import warnings
@@ -29,11 +28,11 @@ from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import SoftUpdate, TD3Loss
 
+from benchmarks.record import save
 from pirl_rl.assembly import make_trainer
 from pirl_rl.commands.composition import compose
 from pirl_rl.envs import ReachAvoidEnv
 from pirl_rl.gymnasium import ReachAvoidVectorGym
-from pirl_rl.machine import describe
 from pirl_rl.rivals.stable_baselines import Paths
 from pirl_rl.trainer import Trainer
 
@@ -225,6 +224,7 @@ def main() -> None:
     torch.set_num_threads(1)
     warnings.filterwarnings("ignore", message="No target network updater")
     found: dict[str, Any] = {}
+    ratios: dict[str, float] = {}
     for name, experiment in EXPERIMENTS.items():
         found[name] = measure(experiment, arguments.rounds, arguments.updates)
         for what, rates in found[name].items():
@@ -232,8 +232,9 @@ def main() -> None:
             print(f"\n{name}, {what}, one thread\n\n| | rate | ours, times faster |\n|---|--:|--:|")
             for label, rate in rates.items():
                 print(f"| {label} | {rate:,.0f} | {first / rate:.1f} |")
-    if arguments.json:
-        arguments.json.write_text(json.dumps({"machine": describe(), "found": found}, indent=2) + "\n")
+            ours, *others = rates.items()
+            ratios |= {f"{what}, {name}, {ours[0]} / {label}": ours[1] / rate for label, rate in others}
+    save(arguments.json, ratios, found=found)
 
 
 if __name__ == "__main__":
