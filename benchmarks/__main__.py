@@ -61,7 +61,7 @@ def run(commands: Mapping[str, str]) -> Iterator[tuple[str, dict[str, Any] | str
     """Run benchmarks one after the other, which print their tables.
 
     Args:
-        commands: files of this folder with their arguments, by the name of the benchmark.
+        commands: files of `FOLDER` with their arguments, by the name of the benchmark.
 
     Yields:
         The name of each benchmark, and its record, or a sentence that says why there is none.
@@ -107,18 +107,23 @@ def collect(commands: Mapping[str, str], path: Path) -> dict[str, float]:
     return ratios
 
 
-def main(commands: Mapping[str, str] | None = None, stored: Path = STORED) -> None:
+def main(stored: Path = STORED) -> None:
+    """The command.
+
+    Args:
+        stored: the file of the stored ratios.
+    """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--short", action="store_true")
     parser.add_argument("--json", type=Path, default=Path("runs/benchmarks.json"))
     parser.add_argument("--store", action="store_true")
     arguments = parser.parse_args()
-    ratios, earlier = collect(commands or (SHORT if arguments.short else ALL), arguments.json), read(stored)
+    ratios, earlier = collect(SHORT if arguments.short else ALL, arguments.json), read(stored)
     print(f"\n## ratios, of which larger ones are better\n\n{table(ratios, earlier['ratios'])}\n")
     if arguments.store:
         save(stored, ratios)
     else:
-        print("\n".join(compare(ratios, earlier["ratios"]) or ["No ratio has become worse."]))
+        print("\n".join(compare(ratios, earlier["ratios"])))
         print(f"The stored ratios are those of {earlier['machine'].get('processor', 'no machine yet')}.")
     print(f"written  {arguments.json}")
 

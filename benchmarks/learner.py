@@ -19,6 +19,7 @@ import argparse
 import itertools
 import statistics
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -266,6 +267,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    warnings.filterwarnings("ignore", message="No target network updater")
     print(f"torch {torch.__version__}, 1 thread, medians of {arguments.rounds} x {arguments.updates} updates")
     rows, found = [], {}
     for shape in SHAPES[-1:] if arguments.short else SHAPES:

@@ -23,24 +23,25 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def compare(measured: Mapping[str, float], stored: Mapping[str, float]) -> list[str]:
-    """A warning for each ratio that is worse by more than `WORSE`, and for each that is not stored.
+    """What is to be said about ratios, in lines: a warning for each that has become worse by more than `WORSE`.
 
-    A stored ratio that was not measured gets none, as it may need a package that is not installed.
+    A last line counts those that are not stored. Nothing is said about a stored ratio that was not measured, as it may
+    need a package that is not installed.
 
     Args:
         measured: the ratios of this run, by name; a larger one is better.
         stored: those with which they are compared.
     """
-    warnings = []
-    for name, ratio in measured.items():
-        if name not in stored:
-            warnings.append(f"warning: no ratio is stored for {name!r}, which is {ratio:.2f}.")
-        elif not ratio * WORSE >= stored[name]:
-            warnings.append(
-                f"warning: {name!r} is {ratio:.2f}, and {stored[name]:.2f} is stored. "
-                f"It has become worse by more than the factor {WORSE}."
-            )
-    return warnings
+    both = [name for name in measured if name in stored]
+    # A ratio that is not a number is worse too.
+    lines = [
+        f"warning: {name!r} is {measured[name]:.2f}, and {stored[name]:.2f} is stored. "
+        f"It has become worse by more than the factor {WORSE}."
+        for name in both
+        if not measured[name] * WORSE >= stored[name]
+    ] or ["No ratio has become worse."]
+    missing = len(measured) - len(both)
+    return [*lines, *([f"Ratios that are not stored: {missing} of {len(measured)}."] if missing else [])]
 
 
 def table(measured: Mapping[str, float], stored: Mapping[str, float]) -> str:
