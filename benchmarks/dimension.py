@@ -329,7 +329,9 @@ def main() -> None:
     report["largest"] = rows[len(swept) :]
     report["sweeps"] = {name: sweep(name, rows[: len(swept)]) for name in SWEEPS}
     show(report)
-    save(arguments.json, ratios(rows), **report)
+    sizes = ("points", "channels", "states")
+    largest = [row for row in rows if all(row[size] == getattr(LARGEST, size) for size in sizes)]
+    save(arguments.json, ratios(largest), **report)
     if arguments.figure:
         save_figures({arguments.figure.stem: draw(report["sweeps"])}, arguments.figure.parent)
 
