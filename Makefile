@@ -30,9 +30,8 @@ docs: $(READY) ## Build the documentation site from nothing; open docs/_build/ht
 	rm -rf docs/_build docs/_generated
 	$(BIN)/sphinx-build -W --keep-going docs docs/_build/html
 
-bench: $(READY) ## Time the learner and the simulator on one thread
-	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/learner.py
-	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/simulator.py
+bench: $(READY) ## Run all benchmarks of speed; ARGS=--short takes a minute and a half
+	$(BIN)/python -m benchmarks $(ARGS)
 
 figures: $(READY) ## Compare all runs below runs/: a table and a figure in runs/comparison
 	$(BIN)/python -m pirl_rl.compare runs --out runs/comparison

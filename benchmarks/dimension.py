@@ -1,6 +1,6 @@
 """The cost of the HJB term in the number N of points, w of noise channels and n of states, exact and randomised.
 
-    python benchmarks/dimension.py [--rounds 15] [--eager] [--json FILE] [--figure FILE]
+    python benchmarks/dimension.py [--rounds 15] [--eager] [--short] [--json FILE] [--figure FILE]
 
 The problem is the half-space of the suite with its noise spread over w channels, and critic and actor have the sizes of
 the default recipe, 3 x 64 and 2 x 64. A term is this loss alone, forward and backward, on one thread: the exact trace
@@ -9,7 +9,8 @@ the products of matrices that it needs, in `torch.matmul` of equal shapes with n
 those of power laws, fitted to the three largest values of N, w or n; all other sizes stay at their largest.
 
 Times are those of the processor, which leave out the waits for other processes, and the smallest of rounds in which all
-cases take turns. `--eager` leaves the terms of the sweeps uncompiled.
+cases take turns. `--eager` leaves the terms of the sweeps uncompiled. `--short` measures one case alone, uncompiled and
+with so few points that its arrays stay in the cache.
 
 Three more measurements compare both traces: the bias of the randomised loss and of its gradient, in standard errors of
 the mean over many draws; the variance of the gradient over batches, for a critic that was fitted to the exact value;
@@ -20,7 +21,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
+import operator
+import statistics
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +37,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from pirl_rl import machine
+from benchmarks.record import save
 from pirl_rl.actor_rules import Hamiltonian
 from pirl_rl.assembly import PROBES
 from pirl_rl.compilation import compiled
@@ -78,6 +80,9 @@ class Case:
 
 
 LARGEST = Case()
+CACHED = replace(LARGEST, points=125)
+"""The case of the short version."""
+
 SWEEPS = {
     "points N": [replace(LARGEST, points=points) for points in (125, 250, 500, 1_000, 2_000)],
     "channels w": [replace(LARGEST, channels=channels) for channels in (1, 4, 10, 20, 50, 100)],
@@ -158,6 +163,9 @@ def products(case: Case, probes: int) -> Callable[[], None]:
 def measure(cases: Sequence[tuple[Case, bool]], rounds: int) -> list[dict[str, Any]]:
     """The times of both traces and of their products, in ms: the smallest of rounds in which all of them take turns.
 
+    Beside them stands "quotient", the median over the rounds of the time of the exact trace by that of the randomised
+    one. It varies less than the smallest times where other processes share the caches.
+
     Args:
         cases: cases, and whether their terms are compiled.
         rounds: the number of rounds.
@@ -170,15 +178,21 @@ def measure(cases: Sequence[tuple[Case, bool]], rounds: int) -> list[dict[str, A
             works[-1][f"{trace}, products"] = products(case, probes)
         for work in works[-1].values():
             work()
-    least = [dict.fromkeys(variants, math.inf) for variants in works]
+    times: list[dict[str, list[float]]] = [{name: [] for name in variants} for variants in works]
     for _ in range(rounds):
-        for variants, times in zip(works, least, strict=True):
+        for variants, entries in zip(works, times, strict=True):
             for name, work in variants.items():
                 start = time.process_time()
                 work()
-                times[name] = min(times[name], 1e3 * (time.process_time() - start))
+                entries[name].append(1e3 * (time.process_time() - start))
     return [
-        {**asdict(case), "compiled": compile, "ms": times} for (case, compile), times in zip(cases, least, strict=True)
+        {
+            **asdict(case),
+            "compiled": compile,
+            "ms": {name: min(values) for name, values in entries.items()},
+            "quotient": statistics.median(map(operator.truediv, *(entries[trace] for trace in TRACES))),
+        }
+        for (case, compile), entries in zip(cases, times, strict=True)
     ]
 
 
@@ -196,6 +210,16 @@ def varied(name: str, case: Case) -> int:
     return {"p": case.points, "c": case.channels, "s": case.states}[name[0]]
 
 
+def ratios(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """The quotients of the times of both traces, by the case of each row."""
+    result = {}
+    for row in rows:
+        sigma, how = "varying" if row["varying"] else "constant", "compiled" if row["compiled"] else "eager"
+        case = f"{row['points']} points, {row['states']} states, {row['channels']} channels, {sigma} sigma, {how}"
+        result[f"HJB term, {case}, exact / randomised"] = row["quotient"]
+    return result
+
+
 def sweep(name: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """The rows of a sweep, out of those of all compiled cases, and what is fitted to them."""
     cases = [asdict(case) for case in SWEEPS[name]]
@@ -205,7 +229,7 @@ def sweep(name: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def show(report: Mapping[str, Any]) -> None:
-    """Print the report of all measurements but the machine."""
+    """Print the report of all measurements."""
     for row in report["largest"]:
         print(row)
     for name, result in report["sweeps"].items():
@@ -285,12 +309,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--eager", action="store_true")
+    parser.add_argument("--short", action="store_true")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--figure", type=Path)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     warnings.filterwarnings("ignore", message="No target network updater")
-    report: dict[str, Any] = {"machine": machine.describe(), "probes": PROBES, "compiled": not arguments.eager}
+    if arguments.short:
+        rows = measure([(CACHED, False)], 2 * arguments.rounds)
+        print("| HJB term, eager | ms |\n|---|--:|")
+        print("\n".join(f"| {variant} | {time:.1f} |" for variant, time in rows[0]["ms"].items()))
+        save(arguments.json, ratios(rows), rows=rows)
+        return
+    report: dict[str, Any] = {"probes": PROBES, "compiled": not arguments.eager}
     report["memory"] = {trace: memory(LARGEST, probes) for trace, probes in TRACES.items()}
     report["bias"] = bias(replace(LARGEST, points=200), 400)
     report["noise"] = [noise(states, 40) for states in (8, 16, 32, 100)]
@@ -302,8 +333,9 @@ def main() -> None:
     report["largest"] = rows[len(swept) :]
     report["sweeps"] = {name: sweep(name, rows[: len(swept)]) for name in SWEEPS}
     show(report)
-    if arguments.json:
-        arguments.json.write_text(json.dumps(report, indent=2) + "\n")
+    sizes = ("points", "channels", "states")
+    largest = [row for row in rows if all(row[size] == getattr(LARGEST, size) for size in sizes)]
+    save(arguments.json, ratios(largest), **report)
     if arguments.figure:
         save_figures({arguments.figure.stem: draw(report["sweeps"])}, arguments.figure.parent)
 

@@ -2,7 +2,7 @@
 
 It also compares the success of a run's policy with that of the grid's.
 
-python benchmarks/grid.py            # one and two dimensions
+python benchmarks/grid.py [--json FILE]   # one and two dimensions
 python benchmarks/grid.py --dubins   # the Dubins car in three dimensions, some minutes
 python benchmarks/grid.py --run RUN_DIR   # a run with at most three states
 """
@@ -13,9 +13,12 @@ import argparse
 import math
 import resource
 import time
+from pathlib import Path
+from typing import Any
 
 import torch
 
+from benchmarks.record import save
 from pirl_rl import load_run
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.grid import GridSolver
@@ -33,8 +36,9 @@ def states(problem, count: int) -> tuple[torch.Tensor, torch.Tensor]:
     return problem.horizon * (0.5 + 0.5 * torch.rand(len(x), generator=rng, dtype=x.dtype)), x
 
 
-def closed_forms() -> None:
-    """Print the largest error, its estimate, the observed order and the seconds for each mesh."""
+def closed_forms() -> list[dict[str, Any]]:
+    """Print and return the largest error, its estimate, the observed order and the seconds for each mesh."""
+    rows = []
     print("| Problem | Points | Largest error | Estimate | Order | Seconds |")
     print("| --- | ---: | ---: | ---: | ---: | ---: |")
     for problem, meshes in MESHES:
@@ -47,7 +51,10 @@ def closed_forms() -> None:
             estimate, order = solution.error(tau, x).max().item(), math.log(before / error, points / previous)
             name = type(problem).__name__
             print(f"| {name} | {points} | {error:.1e} | {estimate:.1e} | {order:.2f} | {seconds:.1f} |")
+            found = {"error": error, "estimate": estimate, "order": None if math.isnan(order) else order}
+            rows.append({"problem": name, "points": points, **found, "seconds": seconds})
             before, previous = error, points
+    return rows
 
 
 def dubins(points: int, rollouts: int = 2_000) -> None:
@@ -84,10 +91,11 @@ if __name__ == "__main__":
     parser.add_argument("--dubins", action="store_true")
     parser.add_argument("--points", type=int, default=51, help="nodes along each axis")
     parser.add_argument("--run", help="compare the policy of this run directory with the grid's")
+    parser.add_argument("--json", type=Path, help="write what is found in one and two dimensions to this file")
     arguments = parser.parse_args()
     if arguments.run:
         against(arguments.run, arguments.points)
     elif arguments.dubins:
         dubins(arguments.points)
     else:
-        closed_forms()
+        save(arguments.json, {}, rows=closed_forms())

@@ -1,12 +1,16 @@
 """CPU seconds of imports, each in a new process, as the smallest of several measurements.
 
-python benchmarks/imports.py
+python benchmarks/imports.py [--json FILE]
 """
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
+from pathlib import Path
+
+from benchmarks.record import save
 
 TRIES = 3
 STATEMENTS = (
@@ -27,9 +31,15 @@ def seconds(statement: str) -> float:
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    found = {}
     print(f"{'import':<64} {'CPU seconds':>12}")
     for statement in STATEMENTS:
-        print(f"{statement:<64} {seconds(statement):>12.2f}")
+        found[statement] = seconds(statement)
+        print(f"{statement:<64} {found[statement]:>12.2f}")
+    save(arguments.json, {}, seconds=found)
 
 
 if __name__ == "__main__":

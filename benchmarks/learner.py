@@ -1,6 +1,6 @@
 """Time of complete updates on one thread: Ito propagation, compiled and eager, against nested autograd.
 
-    python benchmarks/learner.py [--rounds 60] [--updates 4]
+    python benchmarks/learner.py [--rounds 60] [--updates 4] [--short] [--json FILE]
 
 An update computes the TD, HJB and boundary losses with their gradients, makes a step of fused Adam, and every second
 time updates the actor and the target networks too. All variants have equal networks, points, optimisers and loops.
@@ -9,7 +9,8 @@ per noise channel. These derivatives cannot be compiled; the other terms run eag
 compiled". "HJB term" is this loss alone, forward and backward. "matrix products" are those of all forward and backward
 passes alone, eagerly through torch, without activations, samplers and optimisers: the floor of this machine.
 
-The variants take turns of a few updates each. Times are those of the processor, medians over all turns.
+The variants take turns of a few updates each. Times are those of the processor, medians over all turns. `--short`
+measures complete updates in one dimension alone, since to compile the other variants takes minutes.
 """
 
 from __future__ import annotations
@@ -18,13 +19,17 @@ import argparse
 import itertools
 import statistics
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from benchmarks.record import save
 from pirl_rl import compilation
 from pirl_rl.actor_rules import Q
 from pirl_rl.learner import with_gradient
@@ -213,15 +218,19 @@ def milliseconds(work: Callable[[], None], repeats: int) -> float:
     return 1e3 * (time.process_time() - start) / repeats
 
 
-def measure(shape: Shape, rounds: int, updates: int) -> None:
+def measure(shape: Shape, rounds: int, updates: int, short: bool) -> dict[str, Any]:
+    """The median times of all variants in ms, and what they say about ours."""
     variants: dict[str, Variant | MatrixProducts] = {
         "nested autograd": Variant(shape, NestedLoss, compiled=False),
-        "nested, others compiled": Variant(shape, NestedLoss, compiled=True),
+        **({} if short else {"nested, others compiled": Variant(shape, NestedLoss, compiled=True)}),
         "ours, eager": Variant(shape, PIRLLoss, compiled=False),
         "ours, compiled": Variant(shape, PIRLLoss, compiled=True),
         "matrix products": MatrixProducts(shape),
     }
-    works = {(name, part): getattr(variant, part) for name, variant in variants.items() for part in ("update", "hjb")}
+    parts = {"update": "update"} if short else {"update": "update", "HJB term": "hjb"}
+    works = {
+        (name, part): getattr(variant, method) for name, variant in variants.items() for part, method in parts.items()
+    }
     for work in works.values():
         milliseconds(work, 6)
     times: dict[tuple[str, str], list[float]] = {key: [] for key in works}
@@ -229,23 +238,46 @@ def measure(shape: Shape, rounds: int, updates: int) -> None:
         for key, work in works.items():
             times[key].append(milliseconds(work, updates))
     median = {key: statistics.median(entries) for key, entries in times.items()}
-    for name in variants:
-        row = [median[name, part] for part in ("update", "hjb")]
-        gain = [median["nested autograd", part] / median[name, part] for part in ("update", "hjb")]
-        print(f"| {shape.name} | {name} | {row[0]:.2f} | {gain[0]:.2f} | {row[1]:.2f} | {gain[1]:.2f} |")
+    return {"shape": shape.name, "ms": {part: {name: median[name, part] for name in variants} for part in parts}}
+
+
+def show(row: dict[str, Any]) -> None:
+    """Print the times of a shape, and how many times faster than nested autograd each variant is."""
+    for part, times in row["ms"].items():
+        print(f"\n{row['shape']}\n\n| {part} | ms | times faster |\n|---|--:|--:|")
+        for name, time_of in times.items():
+            print(f"| {name} | {time_of:.2f} | {times['nested autograd'] / time_of:.2f} |")
+
+
+def ratios(row: dict[str, Any]) -> dict[str, float]:
+    """The times of other variants by that of ours, by shape and part."""
+    result = {}
+    for part, times in row["ms"].items():
+        for other, ours in (
+            ("nested autograd", "ours, compiled"),
+            ("nested autograd", "ours, eager"),
+            ("matrix products", "ours, compiled"),
+        ):
+            result[f"{part}, {row['shape'].partition(':')[0]}, {other} / {ours}"] = times[other] / times[ours]
+    return result
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=60)
     parser.add_argument("--updates", type=int, default=4)
+    parser.add_argument("--short", action="store_true")
+    parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    print(f"torch {torch.__version__}, 1 thread, medians of {arguments.rounds} x {arguments.updates} updates\n")
-    print("| shape | variant | update, ms | times faster | HJB term, ms | times faster |")
-    print("|---|---|--:|--:|--:|--:|")
-    for shape in SHAPES:
-        measure(shape, arguments.rounds, arguments.updates)
+    warnings.filterwarnings("ignore", message="No target network updater")
+    print(f"torch {torch.__version__}, 1 thread, medians of {arguments.rounds} x {arguments.updates} updates")
+    rows, found = [], {}
+    for shape in SHAPES[-1:] if arguments.short else SHAPES:
+        rows.append(measure(shape, arguments.rounds, arguments.updates, arguments.short))
+        show(rows[-1])
+        found |= ratios(rows[-1])
+    save(arguments.json, found, rows=rows)
 
 
 if __name__ == "__main__":

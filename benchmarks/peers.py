@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import statistics
 import time
 import warnings
@@ -29,11 +28,11 @@ from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import SoftUpdate, TD3Loss
 
+from benchmarks.record import save
 from pirl_rl.assembly import make_trainer
 from pirl_rl.commands.composition import compose
 from pirl_rl.envs import ReachAvoidEnv
 from pirl_rl.gymnasium import ReachAvoidVectorGym
-from pirl_rl.machine import describe
 from pirl_rl.rivals.stable_baselines import Paths
 from pirl_rl.trainer import Trainer
 
@@ -41,6 +40,9 @@ ACTOR, CRITIC, BATCH = (32, 32), (64, 64, 64), 256
 """The widths of the hidden layers, and the transitions of an update."""
 
 EXPERIMENTS = {"the 1-D problem": "reach1d", "the drifting vehicle": "drift"}
+
+OURS = {"updates a second": "pirl_rl", "played steps a second": "pirl_rl, collector"}
+"""The rate of ours that the others are compared with; theirs have policy, noise and storage too."""
 
 SETTINGS = (
     "method=td3",
@@ -225,15 +227,17 @@ def main() -> None:
     torch.set_num_threads(1)
     warnings.filterwarnings("ignore", message="No target network updater")
     found: dict[str, Any] = {}
+    ratios: dict[str, float] = {}
     for name, experiment in EXPERIMENTS.items():
         found[name] = measure(experiment, arguments.rounds, arguments.updates)
         for what, rates in found[name].items():
-            first = next(iter(rates.values()))
+            ours = OURS[what]
             print(f"\n{name}, {what}, one thread\n\n| | rate | ours, times faster |\n|---|--:|--:|")
             for label, rate in rates.items():
-                print(f"| {label} | {rate:,.0f} | {first / rate:.1f} |")
-    if arguments.json:
-        arguments.json.write_text(json.dumps({"machine": describe(), "found": found}, indent=2) + "\n")
+                print(f"| {label} | {rate:,.0f} | {rates[ours] / rate:.1f} |")
+                if not label.startswith("pirl_rl"):
+                    ratios[f"{what}, {name}, {ours} / {label}"] = rates[ours] / rate
+    save(arguments.json, ratios, found=found)
 
 
 if __name__ == "__main__":

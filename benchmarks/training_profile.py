@@ -10,7 +10,6 @@ up to the whole loop; evaluations, checkpoints and the losses of the physics are
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -20,10 +19,10 @@ from typing import Any
 
 import torch
 
+from benchmarks.record import save
 from pirl_rl.assembly import make_trainer
 from pirl_rl.commands.composition import compose
 from pirl_rl.evaluation import evaluate
-from pirl_rl.machine import describe
 from pirl_rl.trainer import Trainer
 
 WARM_UP = 100
@@ -140,8 +139,7 @@ def main() -> None:
                 print(f"  {share:6.1%}  {1e3 * share / row['updates_per_second']:7.2f} ms  {name}")
             print(f"  first update after {row['seconds_to_first_update']:.1f} s; ", end="")
             print(f"{row['evaluations']} evaluations of {row['seconds_of_an_evaluation']:.1f} s each in a run")
-    if arguments.json:
-        arguments.json.write_text(json.dumps({"machine": describe(), "rows": rows}, indent=2) + "\n")
+    save(arguments.json, {}, rows=rows)
 
 
 if __name__ == "__main__":

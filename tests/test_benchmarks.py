@@ -1,0 +1,144 @@
+"""The command that runs all benchmarks: comparison of ratios, benchmarks that cannot run, and what it prints."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks import __main__ as command
+from benchmarks import ratios, time_to_accuracy
+from benchmarks.ratios import WORSE, compare, table
+
+FAKE = """
+import json, sys
+ratio, _, path = sys.argv[1:]
+print("| a table |", flush=True)
+with open(path, "w") as file:
+    json.dump({"machine": {}, "ratios": {"theirs / ours": float(ratio)}, "rows": [1]}, file)
+"""
+"""A benchmark that measures nothing."""
+
+
+def test_a_ratio_that_has_become_worse_gets_a_warning():
+    (warning,) = compare({"a": 1.0, "b": 2.0}, {"a": 1.1 * WORSE, "b": 2.0})
+    assert warning.startswith(f"warning: 'a' is 1.00, and {1.1 * WORSE:.2f} is stored.")
+
+
+def test_ratios_that_are_near_the_stored_ones_or_better_get_none():
+    stored = {"a": 0.99 * WORSE, "b": 2.0, "c": 2.0}
+    assert compare({"a": 1.0, "b": 9.0, "c": 2.0}, stored) == ["No ratio has become worse."]
+
+
+def test_a_ratio_that_is_no_number_gets_a_warning():
+    (warning,) = compare({"a": float("nan")}, {"a": 1.0})
+    assert warning.startswith("warning: 'a' is nan")
+
+
+def test_ratios_that_are_not_stored_are_counted():
+    lines = compare({"a": 1.0, "b": 2.0, "c": 3.0}, {"a": 1.0})
+    assert lines == ["No ratio has become worse.", "Ratios that are not stored: 2 of 3."]
+
+
+def test_nothing_is_said_about_a_stored_ratio_that_was_not_measured():
+    assert compare({}, {"a": 1.0}) == ["No ratio has become worse."]
+
+
+def test_the_table_has_both():
+    assert table({"a": 1.0, "b": 2.0}, {"a": 3.0}).splitlines()[2:] == ["| a | 1.00 | 3.00 |", "| b | 2.00 |  |"]
+
+
+def test_what_is_stored_belongs_to_the_short_version():
+    """Each of its benchmarks has a stored ratio, so that none of them is left without a comparison."""
+    names = {name.partition(":")[0] for name in ratios.read(ratios.STORED)["ratios"]}
+    assert names >= set(command.SHORT)
+
+
+def test_every_benchmark_is_a_file():
+    files = [line.split()[0] for line in (*command.ALL.values(), *command.SHORT.values())]
+    assert all((command.FOLDER / file).is_file() for file in files)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """A folder with one benchmark, from which the command takes its files."""
+    (tmp_path / "fake.py").write_text(FAKE)
+    monkeypatch.setattr(command, "FOLDER", tmp_path)
+    return tmp_path
+
+
+def run(folder: Path, monkeypatch, *arguments: str, **commands: str) -> None:
+    """Run the command with other benchmarks, with results in results.json and stored ratios in stored.json."""
+    monkeypatch.setattr(sys, "argv", ["benchmarks", "--short", "--json", str(folder / "results.json"), *arguments])
+    monkeypatch.setattr(command, "SHORT", commands)
+    command.main(folder / "stored.json")
+
+
+def test_it_prints_tables_stores_ratios_and_warns_of_worse_ones(folder, monkeypatch, capfd):
+    run(folder, monkeypatch, "--store", fake="fake.py 3.0")
+    printed = capfd.readouterr().out
+    assert "## fake: fake.py 3.0" in printed
+    assert "| a table |" in printed
+    assert "| fake: theirs / ours | 3.00 |  |" in printed
+    assert "warning" not in printed
+
+    run(folder, monkeypatch, fake="fake.py 2.9")
+    printed = capfd.readouterr().out
+    assert "| fake: theirs / ours | 2.90 | 3.00 |" in printed
+    assert "No ratio has become worse." in printed
+
+    run(folder, monkeypatch, fake="fake.py 1.0")
+    assert "warning: 'fake: theirs / ours' is 1.00, and 3.00 is stored." in capfd.readouterr().out
+    results = json.loads((folder / "results.json").read_text())
+    assert results["ratios"] == {"fake: theirs / ours": 1.0}
+    assert results["benchmarks"] == {"fake": {"rows": [1]}}
+    assert results["machine"]["python"]
+
+
+def test_benchmarks_that_cannot_run_are_left_out_with_a_sentence(folder, monkeypatch, capfd):
+    monkeypatch.setitem(command.NEEDS, "extra", ("json", "no_such_module"))
+    run(folder, monkeypatch, extra="fake.py 1.0", broken="fake.py nonsense", fake="fake.py 2.0")
+    printed = capfd.readouterr().out
+    assert "skipped: The benchmark needs no_such_module, which this Python does not have." in printed
+    assert "skipped: The benchmark failed with exit status 1." in printed
+    assert "| fake: theirs / ours | 2.00 |" in printed
+    assert json.loads((folder / "results.json").read_text())["skipped"].keys() == {"extra", "broken"}
+
+
+# Time to accuracy
+
+
+def row(update: int, mse: float, seconds: float) -> dict[str, float]:
+    return {"update": update, "mse": mse, "seconds": seconds, "processor": seconds / 2}
+
+
+def test_a_bound_is_reached_at_the_first_update_below_it():
+    curve = [row(50, 1e-2, 20.0), row(100, 9e-4, 21.0), row(150, 2e-3, 22.0), row(200, 5e-4, 23.0)]
+    run = {"first update": {"seconds": 15.0, "processor": 8.0}, "curve": curve}
+    found = time_to_accuracy.reached(run, 1e-3)
+    expected = {"update": 100, "seconds": 21.0, "processor": 10.5}
+    assert found == {**expected, "training seconds": 6.0, "training processor": 2.5}
+    assert time_to_accuracy.reached(run, 1e-4) is None
+
+
+def test_clocks_stand_still_in_pauses(monkeypatch):
+    now = iter([10.0, 12.0, 15.0, 15.5])
+    monkeypatch.setattr(
+        time_to_accuracy.Clocks, "_now", staticmethod(lambda: dict.fromkeys(time_to_accuracy.CLOCKS, next(now)))
+    )
+    clocks = time_to_accuracy.Clocks(started=9.0)
+    assert clocks.read() == {"seconds": 1.0, "processor": 10.0}
+    assert clocks.pause(lambda: "result") == "result"
+    assert clocks.read() == {"seconds": 3.5, "processor": 12.5}
+
+
+def test_the_table_has_both_clocks_and_leaves_out_what_is_not_reached():
+    medians = {"update": 100, "seconds": 21.0, "processor": 10.5, "training seconds": 6.0, "training processor": 2.5}
+    found = {"problem": "reach1d", "bound": 1e-3, "reached": 1, "runs": 2}
+    grid = {"seconds": 0.2, "processor": 0.1, "mse": 1e-4}
+    line = time_to_accuracy.show({**found, "medians": medians, "grid": grid})
+    assert line == "| reach1d | 1.0e-03 | 1 of 2 | 100 | 21.0 (10.5) | 6.0 (2.5) | 0.20 (0.10) |"
+    line = time_to_accuracy.show({**found, "medians": None, "grid": None})
+    assert line == "| reach1d | 1.0e-03 | 1 of 2 |  |  |  |  |"
