@@ -71,8 +71,7 @@ class NestedLoss(PIRLLoss):
         f, sigma = self.problem.drift(x, u), self.problem.diffusion(x, u)
         count = self.num_qvalue_nets
         y = torch.cat([tau.unsqueeze(-1), x], -1).expand(count, -1, -1).contiguous().requires_grad_()
-        with self._critics(networks.critic) as critic:
-            value = critic(y[..., :1], y[..., 1:], action.expand(count, -1, -1))
+        value = networks.critic(y[..., :1], y[..., 1:], action.expand(count, -1, -1))
         (gradient,) = torch.autograd.grad(value.sum(), y, create_graph=True)
         result = -gradient[..., 0] + (gradient[..., 1:] * f).sum(-1)
         for column in sigma.unbind(-1):

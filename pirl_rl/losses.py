@@ -9,9 +9,8 @@ weights are buffers: `loss.hjb_weight = 0.3` changes one in place, also for comp
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from typing import Literal, NamedTuple
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -42,15 +41,16 @@ _cross_entropy = nn.functional.binary_cross_entropy_with_logits
 
 
 class Networks(NamedTuple):
-    """The numbers that the losses read: the parameters of all networks, and the weights (w_TD, w_HJB, w_BC).
+    """What the losses evaluate: the networks, where one module has the parameters of all critics, and the weights.
 
-    With a leading axis over the members of a population, `torch.func.vmap` maps them to the losses of all members.
+    The frozen critic has the parameters of the critic, without gradients; the weights are (w_TD, w_HJB, w_BC).
     """
 
-    critic: TensorDictBase
-    actor: TensorDictBase
-    target_critic: TensorDictBase
-    target_actor: TensorDictBase
+    critic: Critic
+    frozen_critic: Critic
+    target_critic: Critic
+    actor: Actor
+    target_actor: Actor
     weights: Sequence[Tensor]
 
 
@@ -166,16 +166,33 @@ class PIRLLoss(ScheduledTD3Loss):
         for name, value in zip(WEIGHTS, (td_weight, hjb_weight, boundary_weight), strict=True):
             self.register_coeff_buffer(name, float(value))
 
+        self._bind()
+
+    def _bind(self) -> None:
+        """Make modules that share the parameters of this loss, which `TD3Loss` keeps outside of modules.
+
+        To lend the parameters to a module for each call takes the compiler most of its time.
+        """
+        critics, actors = self.qvalue_network_params, self.actor_network_params
+        targets = self.target_qvalue_network_params, self.target_actor_network_params
+        # Lists are no modules, so that the state of the loss has each parameter once.
+        self._critics = [_module(self.qvalue_network, params) for params in (critics, critics.data, targets[0])]
+        self._actors = [_module(self.actor_network, params) for params in (actors, targets[1])]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: entry for name, entry in self.__dict__.items() if name not in ("_critics", "_actors")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._bind()
+
     @property
     def networks(self) -> Networks:
-        """The parameters and the weights of this loss."""
-        return Networks(
-            self.qvalue_network_params,
-            self.actor_network_params,
-            self.target_qvalue_network_params,
-            self.target_actor_network_params,
-            (self.td_weight, self.hjb_weight, self.boundary_weight),
-        )
+        """The networks and the weights of this loss."""
+        critic, frozen, target_critic = self._critics
+        actor, target_actor = self._actors
+        weights = self.td_weight, self.hjb_weight, self.boundary_weight
+        return Networks(critic, frozen, target_critic, actor, target_actor, weights)
 
     def with_noise(self, batch: TensorDictBase) -> TensorDictBase:
         """The batch with the random numbers of the critic loss as its part "noise".
@@ -203,7 +220,7 @@ class PIRLLoss(ScheduledTD3Loss):
 
         Args:
             batch: see `PIRLLoss`; it may have the part "noise", see `with_noise`.
-            networks: replace the parameters and the weights of this loss.
+            networks: replace the networks and the weights of this loss.
         """
         networks = networks or self.networks
         batch = batch if "noise" in batch.keys() else self.with_noise(batch)
@@ -227,12 +244,10 @@ class PIRLLoss(ScheduledTD3Loss):
         tau, x = batch["replay", "tau"], batch["replay", "state"]
         loss = torch.zeros((), device=tau.device)
         if self.logit_penalty:
-            with self._actor(networks.actor) as actor:
-                loss = loss + self.logit_penalty * actor.logits(tau, x).square().mean()
+            loss = loss + self.logit_penalty * networks.actor.logits(tau, x).square().mean()
         points = batch["collocation"] if "collocation" in batch.keys() else batch["replay"]
-        with self._actor(networks.actor) as actor, self._critics(networks.critic.detach()) as critic:
-            objective = self.actor_rule(Solution(self.problem, actor, critic), batch["replay"], points)
-        return loss - objective, {}
+        solution = Solution(self.problem, networks.actor, networks.frozen_critic)
+        return loss - self.actor_rule(solution, batch["replay"], points), {}
 
     def check_rule(self, rule: ActorRule, exploration_noise: float) -> None:
         """Refuse an actor rule that cannot work with these critics and this noise on played actions.
@@ -253,26 +268,13 @@ class PIRLLoss(ScheduledTD3Loss):
 
     def solution(self) -> Solution:
         """The solution on the parameters of this loss: it follows the training."""
-        critics = copy.deepcopy(self.qvalue_network)
-        self.qvalue_network_params.to_module(critics, preserve_module_state=False)
-        return Solution(self.problem, self.actor_network.module, critics.module)  # type: ignore[arg-type]
-
-    @contextmanager
-    def _actor(self, params: TensorDictBase) -> Iterator[Actor]:
-        """The actor module on given parameters."""
-        with params.to_module(self.actor_network, preserve_module_state=False):
-            yield self.actor_network.module  # type: ignore[misc]
-
-    @contextmanager
-    def _critics(self, params: TensorDictBase) -> Iterator[Critic]:
-        """The critic module on stacked parameters of all critics, so that one call gives (critics, N, 1)."""
-        with params.to_module(self.qvalue_network, preserve_module_state=False):
-            yield self.qvalue_network.module  # type: ignore[misc]
+        networks = self.networks
+        return Solution(self.problem, networks.actor, networks.critic)
 
     def _target_action(self, networks: Networks, points: TensorDictBase) -> Tensor:
         """The output (N, m) in [-1, 1] of the target actor, without a gradient."""
-        with torch.no_grad(), self._actor(networks.target_actor) as actor:
-            return actor(points["tau"], points["state"])
+        with torch.no_grad():
+            return networks.target_actor(points["tau"], points["state"])
 
     def _residuals(
         self, networks: Networks, points: TensorDictBase, action: Tensor, probes: Tensor | None = None
@@ -282,8 +284,7 @@ class PIRLLoss(ScheduledTD3Loss):
         With probes (k, N, w) there are k estimates of each, (critics, k, N).
         """
         tau, x, u = points["tau"].squeeze(-1), points["state"], self.problem.controls.denormalize(action)
-        with self._critics(networks.critic) as critic:
-            return generator(critic.at(action), self.problem, tau, x, u, probes)
+        return generator(networks.critic.at(action), self.problem, tau, x, u, probes)
 
     def _td_loss(self, networks: Networks, replay: TensorDictBase, noise: TensorDictBase) -> Tensor:
         """L_TD summed over critics: (Q_i - r - (1 - d) min_j Q_j^-(y', pi^-(y') + noise))^2."""
@@ -291,21 +292,20 @@ class PIRLLoss(ScheduledTD3Loss):
         action = self._target_action(networks, following)
         if self.policy_noise:
             action = (action + noise["smoothing"]).clamp(-1, 1)
-        with torch.no_grad(), self._critics(networks.target_critic) as critic:
-            values = critic(following["tau"], following["state"], action)
+        with torch.no_grad():
+            values = networks.target_critic(following["tau"], following["state"], action)
             value = values.amin(0) if self.target_critics == "min" else values.mean(0)
             target = following["reward"] + (~following["terminated"]) * value
         inputs = replay["tau"], replay["state"], replay["action"]
-        with self._critics(networks.critic) as critic:
-            if self.td_criterion == "squares":
-                error = (critic(*inputs) - target).square()
-            else:
-                # Targets may lie outside [0, 1] by a control variate. The loss is linear in them, so that their mean
-                # counts, and from the logits it has a gradient where the output is rounded to 0 or 1.
-                # Without a bound a network that tells single targets apart would follow them to infinity.
-                logits = critic.logits(*inputs)
-                error = _cross_entropy(logits, target.expand_as(logits), reduction="none")
-                error = error + LOGIT_WEIGHT * (logits.abs() - LARGEST_LOGIT).clamp(min=0).square()
+        if self.td_criterion == "squares":
+            error = (networks.critic(*inputs) - target).square()
+        else:
+            # Targets may lie outside [0, 1] by a control variate. The loss is linear in them, so that their mean
+            # counts, and from the logits it has a gradient where the output is rounded to 0 or 1.
+            # Without a bound a network that tells single targets apart would follow them to infinity.
+            logits = networks.critic.logits(*inputs)
+            error = _cross_entropy(logits, target.expand_as(logits), reduction="none")
+            error = error + LOGIT_WEIGHT * (logits.abs() - LARGEST_LOGIT).clamp(min=0).square()
         return error.squeeze(-1).sum(0).mean()
 
     def _hjb_loss(self, networks: Networks, points: TensorDictBase, noise: TensorDictBase) -> Tensor:
@@ -345,9 +345,15 @@ class PIRLLoss(ScheduledTD3Loss):
     def _boundary_loss(self, networks: Networks, points: TensorDictBase) -> Tensor:
         """L_BC summed over critics: the mean of w (Q_i(y, pi^-(y)) - l_eps)^2 with the weights w of the points."""
         action = self._target_action(networks, points)
-        with self._critics(networks.critic) as critic:
-            value = critic(points["tau"], points["state"], action).squeeze(-1)
+        value = networks.critic(points["tau"], points["state"], action).squeeze(-1)
         return (points["weight"] * _huber(value - points["value"], self.boundary_delta).sum(0)).mean()
+
+
+def _module(network: TensorDictModule, params: TensorDictBase) -> Any:
+    """A module with the structure of a network and with given parameters, stacked ones for critics."""
+    twin = copy.deepcopy(network)
+    params.to_module(twin, preserve_module_state=False)
+    return twin.module
 
 
 def _clipped_noise(like: Tensor, deviation: float, bound: float) -> Tensor:

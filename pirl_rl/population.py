@@ -9,12 +9,14 @@ matrix products are made together.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 
 from pirl_rl import checkpoint
 from pirl_rl.compilation import Compiled
@@ -27,8 +29,18 @@ from pirl_rl.trainer import Trainer
 PARTS: dict[str, Any] = dict(zip(TERMS, (("replay", "next"), "collocation", "boundary"), strict=True))
 """The part of a batch that each term of the critic loss needs."""
 
+PARAMS = (
+    *("qvalue_network_params", "actor_network_params"),
+    *("target_qvalue_network_params", "target_actor_network_params"),
+)
+"""The names of the parameters of a loss: of critics, actor and their targets."""
+
 Trained = Literal["critic", "actor"]
 """The network whose loss is meant."""
+
+
+Program = Callable[[Sequence[TensorDictBase], Sequence[Tensor], TensorDictBase], Gradient]
+"""Maps stacked parameters, weights and batches to the losses (M,), their terms (M,) and their stacked gradients."""
 
 
 class Population:
@@ -175,7 +187,7 @@ class StackedLosses:
 
     def __init__(self, compile: bool):
         self.compile = compile
-        self._programs: dict[str, tuple[Any, Callable[[Networks, TensorDictBase], Gradient]]] = {}
+        self._programs: dict[str, tuple[Any, Program]] = {}
 
     def __call__(self, which: Trained, losses: Sequence[PIRLLoss], batch: TensorDictBase) -> list[Gradient]:
         """The loss of the critics or of the actor of each member, with its terms and its gradient.
@@ -192,8 +204,12 @@ class StackedLosses:
         key = losses[0], losses[0].actor_rule
         if which not in self._programs or self._programs[which][0] != key:
             self._programs[which] = key, self._program(which, losses[0])
+        params: list[Any] = [TensorDict.stack([getattr(loss, name).data for loss in losses]) for name in PARAMS]
+        for trained in params[:2]:
+            trained.requires_grad_()
+        weights = [torch.stack(entries) for entries in zip(*(loss.networks.weights for loss in losses), strict=True)]
         try:
-            loss, terms, gradient = self._programs[which][1](_stacked([one.networks for one in losses]), batch)
+            loss, terms, gradient = self._programs[which][1](params, weights, batch)
         except RuntimeError as error:
             if "vmap" not in str(error):
                 raise
@@ -204,32 +220,38 @@ class StackedLosses:
         own = ({name: values[index] for name, values in terms.items()} for index in range(len(losses)))
         return list(zip(loss, own, zip(*gradient, strict=True), strict=True))  # type: ignore[arg-type]
 
-    def _program(self, which: Trained, loss: PIRLLoss) -> Callable[[Networks, TensorDictBase], Gradient]:
+    def _program(self, which: Trained, loss: PIRLLoss) -> Program:
+        function, params = loss.critic_loss, loss.qvalue_network_params
         if which == "actor":
             # What a rule compiles by itself could not be mapped over the members.
             loss.actor_rule.compile(lambda inner: inner)
-        function, params = loss.critic_loss, loss.qvalue_network_params
-        if which == "actor":
             function, params = loss.actor_loss, loss.actor_network_params
         keys = [tuple(name.split(".")) for name, _ in params.named_parameters()]
+        # The networks of TorchRL's losses are modules without parameters, to which any can be lent.
+        empty: list[Any] = [copy.deepcopy(loss.qvalue_network) for _ in range(3)]
+        empty += [copy.deepcopy(loss.actor_network) for _ in range(2)]
+        critic, frozen, target_critic, actor, target_actor = empty
+        kept = {"preserve_module_state": False}
 
-        def program(networks: Networks, batch: TensorDictBase) -> Gradient:
-            trained = networks.critic if which == "critic" else networks.actor
-            entries = [trained[key] for key in keys]
-            found, terms = torch.func.vmap(lambda own, part: function(part, own))(networks, batch)
+        def of_member(params: Sequence[TensorDictBase], weights: Sequence[Tensor], batch: TensorDictBase):
+            with (
+                params[0].to_module(critic, **kept),
+                params[0].detach().to_module(frozen, **kept),
+                params[1].to_module(actor, **kept),
+                params[2].to_module(target_critic, **kept),
+                params[3].to_module(target_actor, **kept),
+            ):
+                critics = critic.module, frozen.module, target_critic.module
+                return function(batch, Networks(*critics, actor.module, target_actor.module, weights))
+
+        def program(params: Sequence[TensorDictBase], weights: Sequence[Tensor], batch: TensorDictBase) -> Gradient:
+            trained = [params[which == "actor"][key] for key in keys]
+            found, terms = torch.func.vmap(of_member)(params, weights, batch)
             # A member's loss depends on its own parameters alone, so that the sum has the gradients of all.
-            return found.detach(), terms, torch.autograd.grad(found.sum(), entries, allow_unused=True)
+            return found.detach(), terms, torch.autograd.grad(found.sum(), trained, allow_unused=True)
 
         whole = which == "critic" or loss.actor_rule.compiles_whole
         return Compiled(program, f"the loss of the {which}s") if self.compile and whole else program
-
-
-def _stacked(networks: Sequence[Networks]) -> Networks:
-    """The networks with a leading axis over the members; critics and actors take gradients."""
-    *params, weights = zip(*networks, strict=True)
-    critic, actor, target_critic, target_actor = (TensorDict.stack([one.data for one in own]) for own in params)
-    stacked = [torch.stack(entries) for entries in zip(*weights, strict=True)]
-    return Networks(critic.requires_grad_(), actor.requires_grad_(), target_critic, target_actor, stacked)
 
 
 def _completed(batches: Sequence[TensorDictBase]) -> list[TensorDictBase]:
