@@ -113,6 +113,8 @@ class Population:
     def _update(self, k: int) -> list[dict[str, float]]:
         """Make update `k` of all members that have come to it; returns their rows of metrics."""
         due = [index for index in self._active() if self.members[index].update == k]
+        if not due:
+            return []
         learners = [self.members[index].learner for index in due]
         losses = [learner.loss for learner in learners]
         batches = [self._draw(index, k) for index in due]

@@ -14,7 +14,7 @@ from pirl_rl import checkpoint, train
 from pirl_rl.assembly import make_trainer
 from pirl_rl.commands.train import resume
 from pirl_rl.continuation import restore
-from pirl_rl.errors import ArgumentError, DivergenceError, Interrupted
+from pirl_rl.errors import ArgumentError, Interrupted
 from pirl_rl.population import Population
 from pirl_rl.problems import Reach1D
 from pirl_rl.run_directory import RunDirectory
@@ -70,6 +70,19 @@ def test_members_equal_runs_of_their_own(settings, tmp_path):
             assert one == pytest.approx(other, rel=1e-6, nan_ok=True)
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("float64")
+@pytest.mark.filterwarnings("error:.* runs eagerly")
+def test_compiled_losses_give_the_same_members(tmp_path):
+    compiled, eager = (
+        [small_trainer(tmp_path / f"{compile}{seed}", f"seed={seed}", f"compile={compile}") for seed in (0, 1)]
+        for compile in ("true", "false")
+    )
+    population(compiled).train()
+    population(eager).train()
+    assert_equal(compiled, eager, 1e-9)
+
+
 @pytest.mark.usefixtures("float64")
 def test_members_differ_in_schedules_and_rates(tmp_path):
     """Where the schedule of one member has no physics yet, that of another may have it."""
@@ -90,22 +103,23 @@ def test_members_differ_in_schedules_and_rates(tmp_path):
     assert early.count("nan") < late.count("nan")
 
 
-def test_a_member_that_diverges_ends_alone(tmp_path):
+@pytest.mark.parametrize("spoilt", [[0], [0, 1]])
+def test_members_that_diverge_end_alone(spoilt, tmp_path):
     members = [small_trainer(tmp_path / str(seed), f"seed={seed}") for seed in (0, 1)]
     one = population(members)
 
     def spoil():
-        with torch.no_grad():
-            next(iter(members[0].learner.loss.qvalue_network_params.parameters())).fill_(math.nan)
+        for index in spoilt:
+            with torch.no_grad():
+                next(iter(members[index].learner.loss.qvalue_network_params.parameters())).fill_(math.nan)
 
     at_update(members[0], 5, spoil)
     summaries = one.train()
-    assert summaries[0] is None
-    assert summaries[1] is not None
-    assert isinstance(one.errors[0], DivergenceError)
-    assert "update 5" in str(one.errors[0])
-    assert members[1].update == members[1].updates
-    assert all(parameter.isfinite().all() for parameter in members[1].learner.loss.parameters())
+    assert [index for index, summary in enumerate(summaries) if summary is None] == spoilt == [*one.errors]
+    assert all("update 5" in str(error) for error in one.errors.values())
+    for index in {0, 1} - {*spoilt}:
+        assert members[index].update == members[index].updates
+        assert all(parameter.isfinite().all() for parameter in members[index].learner.loss.parameters())
 
 
 @pytest.mark.usefixtures("float64")

@@ -289,12 +289,10 @@ def test_joblib_sweep(tmp_path):
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "environment",
-    [
-        pytest.param({"PATH": "", "CXX": ""}, id="none"),
-        pytest.param({"CXX": "false"}, id="broken", marks=pytest.mark.slow),
-    ],
+    [pytest.param({"PATH": "", "CXX": ""}, id="none"), pytest.param({"CXX": "false"}, id="broken")],
 )
 def test_without_a_compiler_it_warns_once_and_trains(environment, tmp_path):
     cache = {"TORCHINDUCTOR_CACHE_DIR": str(tmp_path / "cache"), "TMPDIR": str(tmp_path)}

@@ -15,6 +15,7 @@ Examples:
     python -m pirl_rl.train +experiment=reach1d +debug=default
     python -m pirl_rl.train +experiment=zermelo method=grid
     python -m pirl_rl.train +experiment=reach1d -m seed=0,1,2
+    python -m pirl_rl.train +experiment=reach1d trainer.seeds=[0,1,2]
     python -m pirl_rl.train resume=runs/reach1d/2026-01-31_12-00-00-0 trainer.updates=20000
 """
 
