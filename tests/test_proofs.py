@@ -18,15 +18,29 @@ from pirl_rl.errors import ProofError
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.grid import GridSolver
 from pirl_rl.networks import Actor
-from pirl_rl.problems import DoubleIntegrator, DubinsCar, Exit1D, HalfSpace, Pendulum, Reach1D, Safety1D, ZermeloBoat
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.problems import (
+    DoubleIntegrator,
+    DubinsCar,
+    Exit1D,
+    HalfSpace,
+    Pendulum,
+    Reach1D,
+    Safety1D,
+    ZermeloBoat,
+)
 from pirl_rl.proofs import LowerBound, Settings, prove_success
 from pirl_rl.proofs.affine import Affine
 from pirl_rl.proofs.boxes import Boxes
 from pirl_rl.proofs.ends import Ends
 from pirl_rl.proofs.faces import face_points, smooth_target
 from pirl_rl.proofs.mesh import mesh_of, product
+from pirl_rl.proofs.normal import NormalEquations
+from pirl_rl.proofs.points import Lattice, Points
+from pirl_rl.proofs.polynomials import TaylorModel
 from pirl_rl.proofs.search import prove
-from pirl_rl.proofs.spline import Spline, knots_of
+from pirl_rl.proofs.spline import Spline, design, knots_of
+from pirl_rl.sets import Box
 
 FUNCTIONS = {
     "abs": lambda z: z.abs(),
@@ -164,6 +178,18 @@ def test_a_spline_and_its_derivatives_are_enclosed(orders):
     assert_bounds(polynomials.model(), value, boxes, torch.Generator().manual_seed(3))
 
 
+def test_bounds_of_polynomials_are_those_of_their_ends_where_they_rise():
+    """e^3 + 2 e + y lies in [-4, 4]; of e^2 - e >= -1/4 the least Bernstein coefficient of degree 3 is -2/3."""
+    powers = torch.zeros(2, 4, 2, dtype=torch.float64)
+    powers[0, 3, 0], powers[0, 1, 0], powers[0, 0, 1] = 1.0, 2.0, 1.0
+    powers[1, 2, 0], powers[1, 1, 0] = 1.0, -1.0
+    low, high = TaylorModel(powers, torch.zeros(2, dtype=torch.float64)).bounds()
+    assert low[0] == pytest.approx(-4, abs=1e-12)
+    assert high[0] == pytest.approx(4, abs=1e-12)
+    assert low[1] == pytest.approx(-2 / 3, abs=1e-12)
+    assert high[1] == pytest.approx(2, abs=1e-12)
+
+
 def test_products_of_splines_and_forms_are_enclosed():
     """W_x sin(3 y) - 2 W_yy + W exp(x): as a Taylor model it is enclosed, and much narrower than as an affine form."""
     spline, oracle = random_spline(1)
@@ -201,11 +227,21 @@ def test_branch_and_bound_finds_the_boxes_that_resist():
         x = boxes.coordinates()[:, 0]
         return -(x * x - 0.01).low, torch.zeros(len(boxes), dtype=torch.long)
 
-    outcome = prove(positive, Boxes.cells(edges), 0.0, 6)
+    outcome = prove(positive, Boxes.cells(edges), 0.0, 6, 1000)
     assert not outcome.proved
     assert outcome.margin == pytest.approx(0.01, rel=0.1)
     assert outcome.left.centre.abs().max() < 0.1 + 2 * outcome.left.half_width.max()
     assert outcome.left.half_width.max() == 0.25 / 2**6
+
+
+def test_a_condition_that_fails_everywhere_is_left_before_its_boxes_are_millions():
+    def fails(boxes):
+        return torch.ones(len(boxes), dtype=torch.float64), torch.zeros(len(boxes), dtype=torch.long)
+
+    outcome = prove(fails, Boxes.cells([np.linspace(-1, 1, 5)]), 0.0, 30, 100)
+    assert len(outcome.left) == 128
+    assert outcome.bounded == 4 + 8 + 16 + 32 + 64 + 128
+    assert outcome.margin == 1.0
 
 
 def test_what_cannot_be_computed_is_not_proved():
@@ -214,7 +250,7 @@ def test_what_cannot_be_computed_is_not_proved():
     def undefined(boxes):
         return torch.full((len(boxes),), torch.nan), torch.zeros(len(boxes), dtype=torch.long)
 
-    outcome = prove(undefined, Boxes.cells([np.linspace(0, 1, 3)]), 0.0, 1)
+    outcome = prove(undefined, Boxes.cells([np.linspace(0, 1, 3)]), 0.0, 1, 1000)
     assert len(outcome.left) == 4
     assert outcome.margin == math.inf
 
@@ -348,6 +384,81 @@ def test_two_states_are_proved_but_not_where_the_policy_is_reversed():
     assert (proof.bound(np.full(200, 2.0), states.numpy()) <= estimate.high.numpy()).mean() > 0.97
     worse = prove_success(Stand(problem, Feedback(-6.0, -1.5, reversed_corner=True)), "none")
     assert worse.bound(tau, x)[1] < 0.05
+
+
+class Cube(ReachAvoidProblem):
+    """dX = (0.3 (X_2, X_3, -X_1) + u) dt + 0.3 dW in R^3 with |u_i| <= 0.3: stay in |x_i| < 1 for T = 1 s."""
+
+    objective = "invariance"
+    horizon = 1.0
+    states, controls = Box([-1.0] * 3, [1.0] * 3), Box([-0.3] * 3, [0.3] * 3)
+
+    def drift(self, x, u):
+        turned = torch.stack([x[..., 1], x[..., 2], -x[..., 0]], -1)
+        return 0.3 * turned + u
+
+    def diffusion(self, x, u):
+        return 0.3 * torch.eye(3, dtype=x.dtype).expand(len(x), 3, 3)
+
+    def avoid_constraints(self, x):
+        return 1 - x.abs()
+
+
+class Towards(nn.Module):
+    """A network that stands for an actor: tanh(-2 x) in each coordinate."""
+
+    def forward(self, tau, state):
+        return torch.tanh(-2.0 * state)
+
+
+def test_three_states_are_proved_on_a_coarse_mesh():
+    problem = Cube()
+    solution = Stand(problem, Towards())
+    proof = prove_success(solution, "none", Settings(cells=8, steps=8))
+    assert "interior" not in proof.resisted
+    assert proof.bound(np.array([1.0]), np.zeros((1, 3)))[0] > 0.5
+    assert_no_point_violates(proof, solution, 100_000)
+
+
+@pytest.mark.slow
+def test_three_states_are_proved_on_the_default_mesh():
+    """Nowhere above the intervals of Monte Carlo with a control step of 0.01 s, but for their confidence of 95 %."""
+    problem, actor = Cube(), Towards()
+    solution = Stand(problem, actor)
+    proof = prove_success(solution, "none")
+    found = proof.to_dict()
+    assert found["share_at_least_0.5"] > 0.4
+    assert found["share_at_least_0.8"] > 0.1
+    assert_no_point_violates(proof, solution, 1_000_000)
+    states = problem.states.sample(200, torch.Generator().manual_seed(1))
+
+    def policy(t, y):
+        return problem.controls.denormalize(actor(t, y))
+
+    estimate = monte_carlo(problem, policy, torch.ones(200), states, 500, dt=0.01)
+    assert (proof.bound(np.ones(200), states.numpy()) <= estimate.high.numpy()).mean() > 0.97
+
+
+def test_least_squares_and_states_on_a_lattice_agree_with_full_matrices():
+    """The band's factors against scipy's general least squares, and products of small matrices against a large one."""
+    problem, rng = Cube(), np.random.default_rng(0)
+    mesh = mesh_of(Ends(problem, success=True), 8, 8)
+    axes = mesh.points([0.0, 0.3, 0.7])
+    chosen = rng.random(len(product(axes))) < 0.3
+    lattice, points = Lattice(problem, mesh, axes, chosen), Points(problem, mesh, product(axes)[chosen])
+    coefficients = rng.normal(size=points.values.shape[1])
+    assert (lattice.x == points.x).all()
+    assert lattice.value(coefficients) == pytest.approx(points.values @ coefficients, abs=1e-12)
+    factors = rng.normal(size=(9, len(points.x)))
+    expected = points.operator(factors) @ coefficients
+    assert (factors * lattice.derive(coefficients)).sum(0) == pytest.approx(expected, abs=1e-9)
+    small = mesh_of(Ends(DoubleIntegrator(), success=True), 8, 8)
+    rows = design(
+        small.space, DoubleIntegrator().states.sample(2_000, torch.Generator().manual_seed(1)).double().numpy()
+    )
+    right = rng.normal(size=2_000)
+    known = np.linalg.lstsq(rows.toarray(), right, rcond=None)[0]
+    assert NormalEquations(rows).solve(right) == pytest.approx(known, abs=1e-8)
 
 
 def test_a_bound_takes_what_its_conditions_lack():

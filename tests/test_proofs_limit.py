@@ -156,15 +156,15 @@ def test_a_spoilt_bound_is_not_proved():
     """A bump of 0.001 in the middle of a proved W, which is curved too much on its flanks, and a W that is raised."""
     limit = prove_limit(Reach1D())
     conditions, boxes = everything(limit.problem, limit.spline)
-    assert prove(conditions.interior, boxes, 0.01, 10).proved
+    assert prove(conditions.interior, boxes, 0.01, 10, 100_000).proved
     spoilt = limit.spline.coefficients.clone()
     spoilt[30, 40] += 1e-3
     conditions, boxes = everything(limit.problem, Spline(limit.spline.edges, spoilt))
-    outcome = prove(conditions.interior, boxes, 0.01, 10)
+    outcome = prove(conditions.interior, boxes, 0.01, 10, 100_000)
     assert not outcome.proved
     assert outcome.margin > 0.1
     conditions, boxes = everything(limit.problem, Spline(limit.spline.edges, limit.spline.coefficients + 0.05))
-    outcome = prove(conditions.start, boxes.at_end(0, 0, -1), 0.01, 10)
+    outcome = prove(conditions.start, boxes.at_end(0, 0, -1), 0.01, 10, 100_000)
     assert outcome.margin > 0.04
 
 

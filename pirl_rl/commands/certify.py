@@ -35,7 +35,8 @@ states.
     With method=interval:
     bounds       lower: a bound of the policy's probability of success from below, the default;
                  upper: one of every policy's from above; [lower,upper]: both
-    cells, steps the numbers of cells of the bound along each state and along tau, 64 and 60 by default
+    cells, steps the numbers of cells of the bound along each state and along tau; by default 64 and 60 with up to two
+                 states, and 16 and 16 with three
     rounds       the largest number of times that the bound is fitted, to points and then to boxes, 40 by default
     halvings     the number of times that a box may be halved, 10 by default
 

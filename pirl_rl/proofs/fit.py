@@ -13,7 +13,7 @@ from pirl_rl.progress import announce
 from pirl_rl.proofs.boundary import LOSS
 from pirl_rl.proofs.boxes import Boxes
 from pirl_rl.proofs.mesh import product
-from pirl_rl.proofs.points import Points
+from pirl_rl.proofs.points import Lattice
 from pirl_rl.proofs.rates import RatesAt
 from pirl_rl.proofs.spline import DEGREE, knots_of
 from pirl_rl.proofs.subsolution import Equation
@@ -55,7 +55,8 @@ class Fit:
     def __init__(self, equation: Equation, rates_at: RatesAt, margin: float):
         self.equation, self.mesh, self.margin = equation, equation.mesh, margin
         problem = equation.ends.problem
-        self._points = Points(problem, self.mesh, self._checked(product(self.mesh.points(PLACES))))
+        axes = self.mesh.points(PLACES)
+        self._points = Lattice(problem, self.mesh, axes, self._checked(product(axes)))
         self._rates = rates_at(self._points)
         self._cells = self.mesh.cell_of(self._points.x)
         self._own_cells = self.mesh.cell_of(equation.points.x)
@@ -66,7 +67,7 @@ class Fit:
         self.spline = equation.solve(self._source)
 
     def _checked(self, x: np.ndarray) -> np.ndarray:
-        """Those of states (N, n) that are outside A and B, and those inside in cells that a face crosses.
+        """Which of states (N, n) are outside A and B, or inside in a cell that a face crosses, (N,) bool.
 
         The latter are left out where W is given in the same cell, since it has a kink there.
         """
@@ -75,7 +76,7 @@ class Fit:
         crossed[self.mesh.cell_of(x[interior])] = True
         cells = self.mesh.cell_of(x)
         np.logical_or.at(given, cells, self.equation.boundary.given(x))
-        return x[interior | (crossed & ~given)[cells]]
+        return interior | (crossed & ~given)[cells]
 
     def at_points(self, rounds: int) -> None:
         """Raise the source until L^u W is what the fit aims at in all cells, or `rounds` times.
@@ -143,4 +144,4 @@ class Fit:
         for tau in self._times:
             derivatives = points.derive(curve(tau))
             moved = np.einsum("kn,kn->n", self._rates(tau, derivatives), derivatives)
-            yield tau, moved - points.values @ rate(tau), points.values @ curve(tau)
+            yield tau, moved - points.value(rate(tau)), points.value(curve(tau))

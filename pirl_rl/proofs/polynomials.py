@@ -6,6 +6,10 @@ which do not cancel. As polynomials they do (K. Makino and M. Berz, Int. J. Pure
 
 from __future__ import annotations
 
+import math
+from fractions import Fraction
+from functools import cache
+
 import torch
 from torch import Tensor
 
@@ -79,10 +83,15 @@ class TaylorModel:
         return TaylorModel(result, factor.radius * self.size + factor.magnitude * self.remainder + rounding)
 
     def bounds(self) -> tuple[Tensor, Tensor]:
-        """A lower and an upper bound (N,)."""
-        centre, size = self.powers.flatten(1)[:, 0], self.size
-        reach = size - centre.abs() + self.powers[0].numel() * ROUNDING * size
-        return centre - reach, centre + reach
+        """A lower and an upper bound (N,): the least and the largest Bernstein coefficient, and the remainder."""
+        values, lengths = self.powers, self.powers.shape[1:]
+        for length in lengths:
+            # Each step replaces the first axis of powers by Bernstein coefficients, which become the last axis.
+            values = values.movedim(1, -1) @ _to_bernstein(length)
+        low, high = values.flatten(1).aminmax(dim=-1)
+        # No entry of the matrices is above 1, so that no sum on the way is larger than the size.
+        reach = self.remainder + 2 * sum(length + 4 for length in lengths) * ROUNDING * self.size
+        return low - reach, high + reach
 
     def minus_absolute(self) -> tuple[TaylorModel, Tensor]:
         """A lower bound of -|g| for these functions g, and whether g may change its sign (N,).
@@ -107,6 +116,26 @@ class TaylorModel:
             weight = order.reshape([-1 if j == axis else 1 for j in range(size.ndim - 1)])
             rows.append((size * weight).flatten(1).sum(-1))
         return torch.stack(rows)
+
+
+@cache
+def _to_bernstein(length: int) -> Tensor:
+    """The matrix (powers, coefficients) from powers of e in [-1, 1] to Bernstein's polynomials on this interval.
+
+    A polynomial is a mean of its Bernstein coefficients with weights that depend on e, so that it lies between the
+    least and the largest of them (R. T. Farouki, Comput. Aided Geom. Des. 29, 2012).
+    """
+    degree = length - 1
+
+    def entry(power: int, number: int) -> float:
+        # With t = (1 + e) / 2, e^m = (2 t - 1)^m, and the coefficients of t^k are C(i, k) / C(degree, k).
+        parts = (
+            Fraction(math.comb(power, k) * 2**k * (-1) ** (power - k) * math.comb(number, k), math.comb(degree, k))
+            for k in range(power + 1)
+        )
+        return float(sum(parts))
+
+    return torch.tensor([[entry(m, i) for i in range(length)] for m in range(length)], dtype=torch.float64)
 
 
 def _grown(powers: Tensor, shape: list[int]) -> Tensor:

@@ -23,7 +23,7 @@ from pirl_rl.proofs.conditions import Conditions, Feedback
 from pirl_rl.proofs.ends import Absorbing, Ends
 from pirl_rl.proofs.fit import Fit
 from pirl_rl.proofs.mesh import mesh_of
-from pirl_rl.proofs.points import Points
+from pirl_rl.proofs.points import States
 from pirl_rl.proofs.proof import LowerBound, UpperBound
 from pirl_rl.proofs.rates import LeastRates, Policy, PolicyRates, RatesAt
 from pirl_rl.proofs.search import Check, Outcome, prove
@@ -36,6 +36,15 @@ MOST_STATES = 3
 MARGIN = 0.01
 """The number that is taken from W at least. No condition of the interior is asked where W is not above it."""
 
+CELLS = {1: 64, 2: 64, 3: 16}
+"""The number of cells along each state by the number of states, so that proofs take minutes and less than 8 GB."""
+
+STEPS = {1: 60, 2: 60, 3: 16}
+"""The number of cells along tau by the number of states."""
+
+BOXES = 65_536
+"""Boxes that resist are halved up to this number of them, or that of the cells of the mesh where it is larger."""
+
 Condition = tuple[str, Check, Boxes]
 """The name of a condition, what bounds it, and the boxes on which it is asked."""
 
@@ -45,8 +54,8 @@ class Settings:
     """The effort of a proof.
 
     Attributes:
-        cells: the number of cells along each state.
-        steps: the number of cells along tau.
+        cells: the number of cells along each state; `CELLS` by default.
+        steps: the number of cells along tau; `STEPS` by default.
         rounds: the largest number of times that W is fitted to points, and then to boxes.
         halvings: the number of times that a box may be halved.
 
@@ -54,14 +63,15 @@ class Settings:
         ArgumentError: a number is too small.
     """
 
-    cells: int = 64
-    steps: int = 60
+    cells: int | None = None
+    steps: int | None = None
     rounds: int = 40
     halvings: int = 10
 
     def __post_init__(self):
         for name, least in (("cells", 8), ("steps", 8), ("rounds", 1), ("halvings", 0)):
-            check_integer(name, getattr(self, name), least)
+            if getattr(self, name) is not None:
+                check_integer(name, getattr(self, name), least)
 
 
 @dataclass(frozen=True)
@@ -102,7 +112,7 @@ def prove_success(solution: Solution, networks: str, settings: Settings | None =
     def feedback(z: Any) -> Any:
         return policy(z[:, 0], z[:, 1:])
 
-    def rates_at(points: Points) -> PolicyRates:
+    def rates_at(points: States) -> PolicyRates:
         return PolicyRates(points, policy)
 
     claim = Claim(Ends(solution.problem, True), policy, rates_at, feedback, [])
@@ -146,17 +156,22 @@ def _prove(claim: Claim, settings: Settings | None) -> dict[str, Any]:
     """The fields of a proof."""
     settings, started = settings or Settings(), time.perf_counter()
     announce("fitting a bound")
-    mesh = mesh_of(claim.ends, settings.cells, settings.steps)
+    dim = claim.ends.problem.states.dim
+    mesh = mesh_of(claim.ends, settings.cells or CELLS[dim], settings.steps or STEPS[dim])
     cells = Boxes.cells([*mesh.edges, *claim.controls])
+    most = max(len(cells), BOXES)
     fit = Fit(Equation(claim.ends, claim.policy, mesh), claim.rates_at, MARGIN)
     fit.at_points(settings.rounds)
 
     def conditions() -> Conditions:
         return Conditions(claim.ends, claim.feedback, fit.spline, MARGIN)
 
-    outcomes = {"interior": _fit_on_boxes(fit, conditions, cells, settings)}
+    def search(check: Check, boxes: Boxes) -> Outcome:
+        return prove(check, boxes, MARGIN, settings.halvings, most)
+
+    outcomes = {"interior": _fit_on_boxes(fit, conditions, cells, settings.rounds, search)}
     for name, check, boxes in _boundary(conditions(), cells):
-        outcomes[name] = prove(check, boxes, MARGIN, settings.halvings)
+        outcomes[name] = search(check, boxes)
     return {
         "problem": claim.ends.problem,
         "spline": fit.spline,
@@ -168,13 +183,19 @@ def _prove(claim: Claim, settings: Settings | None) -> dict[str, Any]:
     }
 
 
-def _fit_on_boxes(fit: Fit, conditions: Callable[[], Conditions], everywhere: Boxes, settings: Settings) -> Outcome:
+def _fit_on_boxes(
+    fit: Fit,
+    conditions: Callable[[], Conditions],
+    everywhere: Boxes,
+    rounds: int,
+    search: Callable[[Check, Boxes], Outcome],
+) -> Outcome:
     """Raise the source where L^u W >= 0 is not proved, until it is; the boxes that are left are those of all cells."""
     cells = everywhere
-    for number in range(1, settings.rounds + 1):
+    for number in range(1, rounds + 1):
         announce(f"proving the bound, round {number}")
         present = conditions()
-        outcome = prove(present.interior, cells, MARGIN, settings.halvings)
+        outcome = search(present.interior, cells)
         if outcome.proved and cells is everywhere:
             return outcome
         if outcome.proved:
@@ -184,7 +205,7 @@ def _fit_on_boxes(fit: Fit, conditions: Callable[[], Conditions], everywhere: Bo
             break
         # The source changes W little elsewhere. All cells are proved again in the end.
         cells = everywhere.around(outcome.left)
-    return prove(conditions().interior, everywhere, MARGIN, settings.halvings)
+    return search(conditions().interior, everywhere)
 
 
 def _policy(solution: Solution) -> Policy:

@@ -1,6 +1,6 @@
 """The control for which a fit asks L^u W >= 0: that of a policy, or at each state the one with the least L^u W.
 
-The factors of a fit are the drift and the covariances at points, (terms, N) as in `Points.factors`, for a time to go
+The factors of a fit are the drift and the covariances at points, (terms, N) as in `States.factors`, for a time to go
 and the derivatives (terms, N) of W. They make the equation of W, and prove nothing.
 """
 
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from pirl_rl.problem import has_controlled_noise
-from pirl_rl.proofs.points import Points
+from pirl_rl.proofs.points import States
 
 Policy = Callable[[Tensor, Tensor], Tensor]
 """Maps tau (N,) and x (N, n), float64, to the control (N, m) in SI units."""
@@ -21,14 +21,14 @@ Policy = Callable[[Tensor, Tensor], Tensor]
 Rates = Callable[[float, np.ndarray], np.ndarray]
 """Maps a time to go and the derivatives (terms, N) of W to the factors (terms, N)."""
 
-RatesAt = Callable[[Points], Rates]
+RatesAt = Callable[[States], Rates]
 """Gives the rates at points."""
 
 PLACES = 5
 """The number of values that are compared along each control, with both ends of its range among them."""
 
 
-def controls_at(policy: Policy, tau: float, points: Points) -> Tensor:
+def controls_at(policy: Policy, tau: float, points: States) -> Tensor:
     """The controls (N, m) of a policy at points, with one time to go."""
     x = torch.from_numpy(points.x)
     return policy(torch.full((len(x),), tau, dtype=torch.float64), x)
@@ -42,7 +42,7 @@ class PolicyRates:
         policy: the policy.
     """
 
-    def __init__(self, points: Points, policy: Policy):
+    def __init__(self, points: States, policy: Policy):
         self._points, self._policy = points, policy
         self._controls: dict[float, Tensor] = {}
 
@@ -62,7 +62,7 @@ class LeastRates:
         points: the states.
     """
 
-    def __init__(self, points: Points):
+    def __init__(self, points: States):
         self._points, box = points, points.problem.controls
         low, high = (torch.tensor(end, dtype=torch.float64) for end in (box.low, box.high))
         self._middle = ((low + high) / 2).expand(len(points.x), -1)

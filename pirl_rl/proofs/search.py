@@ -36,7 +36,7 @@ class Outcome:
         return not len(self.left)
 
 
-def prove(check: Check, boxes: Boxes, margin: float, halvings: int) -> Outcome:
+def prove(check: Check, boxes: Boxes, margin: float, halvings: int, most: int) -> Outcome:
     """Prove a condition on boxes, by halving those on which it is not proved.
 
     Args:
@@ -44,6 +44,8 @@ def prove(check: Check, boxes: Boxes, margin: float, halvings: int) -> Outcome:
         boxes: the boxes to begin with.
         margin: the wanted margin.
         halvings: the number of times that a box may be halved.
+        most: the largest number of boxes that are halved at once; when more resist, they are left. In four dimensions
+            those of a condition that fails would soon be millions.
     """
     bounded = 0
     for number in range(halvings + 1):
@@ -57,7 +59,7 @@ def prove(check: Check, boxes: Boxes, margin: float, halvings: int) -> Outcome:
             needed = max(needed, margins.max().item())
         bounded += len(boxes)
         boxes = Boxes.join(left)
-        if not len(boxes) or number == halvings:
+        if not len(boxes) or len(boxes) > most or number == halvings:
             break
         boxes = boxes.halves(torch.cat(axes))
     return Outcome(boxes, needed, bounded)

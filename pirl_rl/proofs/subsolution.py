@@ -15,12 +15,12 @@ import numpy as np
 import scipy.sparse as sp
 import torch
 from scipy.interpolate import make_interp_spline
-from scipy.sparse.linalg import SuperLU, splu
 
 from pirl_rl.proofs.boundary import Boundary, smoothstep
 from pirl_rl.proofs.ends import Ends
 from pirl_rl.proofs.faces import cells_from
 from pirl_rl.proofs.mesh import GAUSS, Mesh, product
+from pirl_rl.proofs.normal import NormalEquations
 from pirl_rl.proofs.points import Points
 from pirl_rl.proofs.rates import Policy, controls_at
 from pirl_rl.proofs.spline import DEGREE, Spline, design
@@ -51,16 +51,14 @@ class Step:
     Attributes:
         implicit: the share of the new level in the operator: 1, or 1/2 for the trapezoidal rule.
         operator: that of the new level at the points of the interior.
-        rows: the matrix (equations, N).
         ends: where W is given, the values (K,) at this time to go.
-        normal: the factors of the normal equations.
+        normal: the normal equations of the new level.
     """
 
     implicit: float
     operator: Any
-    rows: Any
     ends: np.ndarray
-    normal: SuperLU
+    normal: NormalEquations
 
 
 class Equation:
@@ -90,7 +88,7 @@ class Equation:
             if new < 1:
                 right += (1 - new) * length * (self._steps[k - 2].operator @ rows[-1])
             right = np.concatenate([right, FACE_WEIGHT * step.ends, np.zeros(self._smoothing.shape[0])])
-            rows.append(step.normal.solve(step.rows.T @ right))
+            rows.append(step.normal.solve(right))
         # make_interp_spline has no knots at the first and the last inner level. The spline that has all knots and the
         # same slopes at both ends is the same function.
         slopes = make_interp_spline(taus, np.array(rows), k=DEGREE)(taus[[0, -1]], nu=1)
@@ -104,9 +102,7 @@ class Equation:
         interior = self.points.values - new * (taus[k] - taus[k - 1]) * operator
         given, ends = self.boundary.at(taus[k])
         rows = sp.vstack([interior, FACE_WEIGHT * given, self._smoothing]).tocsr()
-        symmetric = {"SymmetricMode": True}
-        normal = splu((rows.T @ rows).tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=1e-3, options=symmetric)
-        return Step(new, operator, rows, ends, normal)
+        return Step(new, operator, ends, NormalEquations(rows))
 
     def _start_from(self, x: np.ndarray) -> np.ndarray:
         """The coefficients (N,) of W at tau = 0, from its values at points (P, n)."""
@@ -126,7 +122,7 @@ class Equation:
             values *= smoothstep(levels / (width * levels.max(0))).prod(-1)
         rows = sp.vstack([design(self.mesh.space, x), self._smoothing]).tocsr()
         right = np.concatenate([values, np.zeros(self._smoothing.shape[0])])
-        return splu((rows.T @ rows).tocsc()).solve(rows.T @ right)
+        return NormalEquations(rows).solve(right)
 
     def _ramp_to_sides(self, x: np.ndarray) -> np.ndarray:
         """A function (P,) that falls from 1 in the box of states to 0 on those sides of the mesh that lie beyond it."""

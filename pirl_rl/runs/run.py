@@ -210,12 +210,15 @@ class Run:
         certifiers = make_certifiers(names, episodes, at_least, states, rollouts, share, success)
         return certify(self.solution, simulator, where, certifiers, confidence, picked_from, seed, corollary)
 
-    def prove(self, cells: int = 64, steps: int = 60, rounds: int = 40, halvings: int = 10) -> LowerBound:
+    def prove(
+        self, cells: int | None = None, steps: int | None = None, rounds: int = 40, halvings: int = 10
+    ) -> LowerBound:
         """Prove a lower bound of the policy's probability of success under continuous feedback, see `pirl_rl.proofs`.
 
         Args:
-            cells: the number of cells of the bound's mesh along each state, at most three.
-            steps: the number of its cells along tau.
+            cells: the number of cells of the bound's mesh along each state, at most three; by default 64 with up to
+                two states and 16 with three.
+            steps: the number of its cells along tau; by default 60 with up to two states and 16 with three.
             rounds: the largest number of times that the bound is fitted to points, and then to boxes.
             halvings: the number of times that a box may be halved.
 
@@ -224,7 +227,9 @@ class Run:
         """
         return prove_success(self.solution, self._digest(), Settings(cells, steps, rounds, halvings))
 
-    def prove_limit(self, cells: int = 64, steps: int = 60, rounds: int = 40, halvings: int = 10) -> UpperBound:
+    def prove_limit(
+        self, cells: int | None = None, steps: int | None = None, rounds: int = 40, halvings: int = 10
+    ) -> UpperBound:
         """Prove an upper bound of the probability of success of every policy, which does not depend on the networks.
 
         The arguments and the errors are those of `prove`.
