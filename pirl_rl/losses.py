@@ -165,7 +165,6 @@ class PIRLLoss(ScheduledTD3Loss):
         self.logit_penalty = logit_penalty
         for name, value in zip(WEIGHTS, (td_weight, hjb_weight, boundary_weight), strict=True):
             self.register_coeff_buffer(name, float(value))
-
         self._bind()
 
     def _bind(self) -> None:
