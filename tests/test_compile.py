@@ -6,14 +6,16 @@ import shutil
 import warnings
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
-from small import EVENTS, QUICK, at_each_update, command, small_trainer
+from small import EVENTS, PHYSICS, QUICK, at_each_update, command, small_trainer
 from torch._dynamo.utils import counters
 
 from pirl_rl import learner
 from pirl_rl.actor_rules import BestControl, ClippedSurrogate, LookAhead
 from pirl_rl.compilation import compiled
+from pirl_rl.run_directory import RunDirectory
 from pirl_rl.simulator import Simulator
 
 RULES = (
@@ -133,3 +135,19 @@ def test_a_table_may_be_interpolated_in_physics_that_are_differentiated_twice():
 
     x = 2 * torch.rand(300, 3, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(compiled(curvature, whole=True)(x), torch.full_like(x, 6.0))
+
+
+@pytest.mark.slow
+@needs_compiler
+@pytest.mark.usefixtures("float64")
+@pytest.mark.parametrize("settings", [(), PHYSICS, ("method=td3",), (*PHYSICS, "loss.hjb_probes=2")], ids=str)
+def test_compiled_and_eager_trainings_have_the_same_curves(settings, tmp_path):
+    """All metrics of 20 updates, also with noise in the loss, which is drawn outside of the compiled program."""
+    tables = []
+    for compile in ("true", "false"):
+        trainer = small_trainer(tmp_path / compile, *settings, f"compile={compile}")
+        trainer.train()
+        assert trainer.learner.compile == (compile == "true")
+        tables.append(np.genfromtxt(RunDirectory(tmp_path / compile).metrics, delimiter=",", skip_header=1))
+    assert len(tables[0]) > 5
+    np.testing.assert_allclose(*tables, rtol=1e-6, atol=1e-9)
