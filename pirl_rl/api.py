@@ -89,7 +89,7 @@ def train(
         quiet_libraries()
         train_new(config, path, typed, trust, problem)
     modules = [*config.trust, *named_modules(typed), *trust]
-    if seeds is not None:
+    if config.trainer.seeds is not None:
         return [load_run(path / name, modules, problem=problem) for name in member_names(config)]
     return load_run(path, modules, problem=problem)
 

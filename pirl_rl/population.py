@@ -3,8 +3,8 @@
 The members differ in their seeds, in their loss weights or in their learning rates. Each is a whole `Trainer`, with an
 environment, a replay buffer, optimisers, random numbers and a run directory of its own, so that its run equals the one
 that it would have alone, up to rounding. An update stacks the networks and the batches of all members along a leading
-axis, and `torch.func.vmap` maps the losses over that axis. Everything is compiled once for all members, and their
-matrix products are made together.
+axis, and `torch.func.vmap` maps the losses over that axis, so that they are compiled once and evaluated together. The
+members play one after another.
 """
 
 from __future__ import annotations

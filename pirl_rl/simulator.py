@@ -28,7 +28,7 @@ from torch import Tensor
 from pirl_rl.clock import Clock
 from pirl_rl.compilation import Compiled
 from pirl_rl.errors import ArgumentError
-from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.problem import ReachAvoidProblem, noise_channels
 from pirl_rl.sigma import constant_matrix, times, transposed_times
 
 
@@ -95,10 +95,10 @@ class Simulator:
         """The same simulator with compiled sub-steps, which are compiled once however often it is asked for."""
         return replace(self, compile=True)
 
-    @property
+    @cached_property
     def channels(self) -> int:
         """The number w of noise channels."""
-        return self._random_numbers[0]
+        return noise_channels(self.problem)
 
     @cached_property
     def constant_sigma(self) -> Tensor | None:
@@ -163,20 +163,19 @@ class Simulator:
 
         They are drawn here, so that `_advance` is a function without side effects, which can be compiled.
         """
-        channels, *faces = self._random_numbers
         kind = {"generator": rng, "dtype": x.dtype, "device": x.device}
-        normal = torch.randn((channels, *x.shape[:-1]), **kind)
-        target, avoid = (torch.rand((*x.shape[:-1], count), **kind) if count else None for count in faces)
+        normal = torch.randn((self.channels, *x.shape[:-1]), **kind)
+        target, avoid = (torch.rand((*x.shape[:-1], count), **kind) if count else None for count in self._crossings)
         return normal, target, avoid
 
     @cached_property
-    def _random_numbers(self) -> tuple[int, int, int]:
-        """The number w of noise channels, and of the constraints of A and of B whose crossings are drawn."""
-        problem, bridge, rng = self.problem, self.crossing == "bridge", torch.Generator().manual_seed(0)
-        x, u = problem.states.sample(2, rng), problem.controls.sample(2, rng)
+    def _crossings(self) -> tuple[int, int]:
+        """The numbers of constraints of A and of B whose crossings are drawn."""
+        problem, bridge = self.problem, self.crossing == "bridge"
+        x = problem.states.sample(2, torch.Generator().manual_seed(0))
         target = problem.reached_constraints(x).shape[-1] if bridge and problem.objective == "reach-avoid" else 0
         avoid = problem.avoid_constraints(x).shape[-1] if bridge and problem.has_avoid_set else 0
-        return problem.diffusion(x, u).shape[-1], target, avoid
+        return target, avoid
 
     def _advance(
         self,

@@ -45,8 +45,10 @@ class Solution:
 
     @property
     def _weight(self) -> Tensor:
-        # In a loss of a population the weights are no parameters but tensors that `torch.func.vmap` has wrapped.
-        return self.actor.layers[-2].weight  # type: ignore[return-value]
+        """One of the weights of the actor."""
+        # In a loss of a population the actor has no parameters, but tensors that `torch.func.vmap` has wrapped.
+        parameter = next(self.actor.parameters(), None)
+        return self.actor.layers[-2].weight if parameter is None else parameter  # type: ignore[return-value]
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All numbers that the policy and V are computed from, by name."""

@@ -129,19 +129,15 @@ def prove_limit(problem: ReachAvoidProblem, settings: Settings | None = None) ->
     Raises:
         ProofError: there are too many states or periodic ones, or a function has no enclosure.
     """
-    box = problem.controls
+    _check(problem)
+    announce("solving on a grid")
+    # W is fitted to a policy that is nearly the best. The proof does not depend on it.
+    policy = GridSolver(problem, estimate=False).solve().policy
 
     def feedback(z: Affine) -> Affine:
         return z[:, 1 + problem.states.dim :]
 
-    def policy(tau: Tensor, x: Tensor) -> Tensor:
-        return solution.policy(tau, x)
-
-    _check(problem)
-    announce("solving on a grid")
-    # W is fitted to a policy that is nearly the best. The proof does not depend on it.
-    solution = GridSolver(problem, estimate=False).solve()
-    controls = [np.array(ends) for ends in zip(box.low, box.high, strict=True)]
+    controls = [np.array(ends) for ends in zip(problem.controls.low, problem.controls.high, strict=True)]
     return UpperBound(**_prove(Claim(Ends(problem, False), policy, LeastRates, feedback, controls), settings))
 
 
