@@ -37,6 +37,7 @@ ALL = {
     "simulator": "simulator.py",
     "training profile": "training_profile.py",
     "population": "population.py",
+    "data parallel": "data_parallel.py",
     "collector, sync": "collectors.py collector=sync +experiment=reach1d --updates 1500 --seconds 20",
     "collector, multi_async": "collectors.py collector=multi_async collector.workers=2 +experiment=reach1d "
     "--updates 1500 --seconds 20",

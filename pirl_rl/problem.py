@@ -176,6 +176,27 @@ def has_controlled_noise(problem: ReachAvoidProblem, points: int = 256, seed: in
     return not torch.equal(one, other)
 
 
+ROUNDING = 1e-9
+"""The relative difference from an affine drift, in double precision, that counts as rounding."""
+
+
+def is_control_affine(problem: ReachAvoidProblem, points: int = 256, seed: int = 0) -> bool:
+    """Whether the drift is affine in u and sigma does not depend on u, judged at random states and controls.
+
+    Args:
+        problem: the physics.
+        points: the number of states, each with two controls and a random point on the line through them.
+        seed: of the points.
+    """
+    rng = torch.Generator().manual_seed(seed)
+    x = problem.states.sample(points, rng, torch.float64)
+    one, other = (problem.controls.sample(points, rng, torch.float64) for _ in range(2))
+    share = torch.rand(points, 1, generator=rng, dtype=torch.float64)
+    expected = (1 - share) * problem.drift(x, one) + share * problem.drift(x, other)
+    gap = (problem.drift(x, (1 - share) * one + share * other) - expected).abs()
+    return bool((gap <= ROUNDING * expected.abs().amax(0)).all()) and not has_controlled_noise(problem, points, seed)
+
+
 def _normalized(levels, x: Tensor) -> Tensor:
     """g/|grad g| (*, k) of each of the k levels: the signed distance to the surface g = 0, to first order."""
     value, pullback = torch.func.vjp(levels, x)  # type: ignore[misc]

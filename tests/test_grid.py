@@ -171,12 +171,45 @@ def test_a_turned_problem_on_the_circle_has_the_turned_value():
     assert values[0].min() == 0
 
 
+class Calming(ReachAvoidProblem):
+    """dX = (0.5 + (u - 0.3)^2) dW: stay in |x| < 1. The least noise is best, at u = 0.3 between the common levels."""
+
+    horizon, objective = 1.0, "invariance"
+    states, controls = Box([-1.0], [1.0]), Box([-1.0], [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.zeros_like(x)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return (0.5 + (u - 0.3).square()).unsqueeze(-1)
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        return 1 - x[..., 0].abs()
+
+    def exact_value(self, tau: Tensor, x: Tensor) -> Tensor:
+        """The eigenfunctions of the interval, sum_k 4/(pi k) sin(k pi (x + 1)/2) exp(-(k pi/4)^2 tau/2), k odd."""
+        k = torch.arange(1, 60, 2, dtype=torch.float64)
+        wave = torch.sin(k * math.pi * (x + 1) / 2) * 4 / (math.pi * k)
+        return (wave * torch.exp(-((k * math.pi / 4) ** 2) * tau.unsqueeze(-1) / 2)).sum(-1)
+
+
+def test_a_control_inside_the_box_may_be_the_best():
+    problem = Calming()
+    x = torch.linspace(-0.9, 0.9, 19, dtype=torch.float64).unsqueeze(-1)
+    tau = torch.ones(19, dtype=torch.float64)
+    solution, few = (GridSolver(problem, points=101, levels=levels).solve() for levels in (None, 3))
+    torch.testing.assert_close(solution.value(tau, x), problem.exact_value(tau, x), rtol=0, atol=2e-3)
+    assert (solution.policy(tau, x) - 0.3).abs().max() < 0.05
+    assert (problem.exact_value(tau, x) - few.value(tau, x)).max() > 0.05
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"problem": CartPole()}, "problem: expected at most 3 states for a grid, got 4"),
         ({"problem": Reach1D(), "points": 4}, "points: expected 1 numbers >= 5, or one, got 4"),
-        ({"problem": Reach1D(), "steps": 1}, r"steps, levels: expected both >= 2, got 1 and 3"),
+        ({"problem": Reach1D(), "steps": 1}, "steps: expected a number >= 2, got 1"),
+        ({"problem": Reach1D(), "levels": 1}, "levels: expected a number >= 2, got 1"),
         ({"problem": Reach1D(), "margin": [-1.0]}, r"margin: expected 1 numbers >= 0, got \[-1.0\]"),
     ],
 )

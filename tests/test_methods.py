@@ -18,8 +18,11 @@ EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml") if path.stem != "grid")
 """The methods that learn."""
 
-REFUSED = {("drift_refine", method) for method in METHODS if method != "pirl"}
-"""The refinement continues a run of PIRL by stages of its own, which no other method has."""
+CONTINUED = ("drift_refine", "drift_value")
+"""The experiments that continue a run of PIRL by stages of their own, which no other method has."""
+
+REFUSED = {(experiment, method) for experiment in CONTINUED for method in METHODS if method != "pirl"}
+"""The experiments with the methods that they are not made for."""
 
 TERMS = {"td3": "t", "pinn": "pb", "pinn_paper": "pb", "fixed": "t", "pirl": "t", "pirl_paper": "tpb"}
 """The loss terms of a method: temporal differences, PDE, boundary."""
@@ -76,7 +79,7 @@ def test_an_experiment_runs_the_method_that_it_names(experiment):
         assert found == value, key
 
 
-@pytest.mark.parametrize("experiment", [name for name in EXPERIMENTS if name != "drift_refine"])
+@pytest.mark.parametrize("experiment", [name for name in EXPERIMENTS if name not in CONTINUED])
 def test_the_grid_is_a_method_of_every_experiment(experiment):
     config = composed(experiment, "method=grid")
     assert (config.method_name, config.grid["_target_"]) == ("grid", "pirl_rl.grid.GridSolver")

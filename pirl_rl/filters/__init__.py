@@ -6,7 +6,7 @@ u = filtered(tau, x)
 
 from pirl_rl.filters.filter import MODES, ReachAvoidFilter
 from pirl_rl.filters.least_restrictive import LeastRestrictive
-from pirl_rl.filters.smallest_change import SmallestChange, is_control_affine, nearest_action
+from pirl_rl.filters.smallest_change import SmallestChange, nearest_action
 from pirl_rl.filters.step_ahead import values_ahead
 from pirl_rl.filters.submartingale import Submartingale
 
@@ -16,7 +16,6 @@ __all__ = [
     "ReachAvoidFilter",
     "SmallestChange",
     "Submartingale",
-    "is_control_affine",
     "nearest_action",
     "values_ahead",
 ]

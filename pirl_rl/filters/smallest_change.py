@@ -8,14 +8,8 @@ import torch
 from torch import Tensor
 
 from pirl_rl.errors import ArgumentError
-from pirl_rl.problem import ReachAvoidProblem, has_controlled_noise
+from pirl_rl.problem import is_control_affine
 from pirl_rl.solution import Solution
-
-POINTS = 256
-"""The number of states at which the drift is tested."""
-
-ROUNDING = 1e-9
-"""The relative difference from an affine drift, in double precision, that counts as rounding."""
 
 
 @dataclass(frozen=True)
@@ -98,20 +92,3 @@ def nearest_action(action: Tensor, offset: Tensor, slope: Tensor) -> tuple[Tenso
     share = torch.where((low < 0) & (high > 0), -low / (high - low), torch.ones_like(low)).unsqueeze(-1)
     nearest = at(path, before) + share * (at(path, after) - at(path, before))
     return nearest.clamp(-1, 1), ~met[0]
-
-
-def is_control_affine(problem: ReachAvoidProblem, points: int = POINTS, seed: int = 0) -> bool:
-    """Whether the drift is affine in u and sigma does not depend on u, judged at random states and controls.
-
-    Args:
-        problem: the physics.
-        points: the number of states, each with two controls and a random point on the line through them.
-        seed: of the points.
-    """
-    rng = torch.Generator().manual_seed(seed)
-    x = problem.states.sample(points, rng, torch.float64)
-    one, other = (problem.controls.sample(points, rng, torch.float64) for _ in range(2))
-    share = torch.rand(points, 1, generator=rng, dtype=torch.float64)
-    expected = (1 - share) * problem.drift(x, one) + share * problem.drift(x, other)
-    gap = (problem.drift(x, (1 - share) * one + share * other) - expected).abs()
-    return bool((gap <= ROUNDING * expected.abs().amax(0)).all()) and not has_controlled_noise(problem, points, seed)

@@ -1,12 +1,12 @@
 """Candidate controls, among which policy iteration chooses the best one at each node.
 
-Up to `MOST` of them are the tensor product of equidistant levels along the axes of the box of controls. For a drift
-that is affine in u and a sigma without u the best control is a vertex of the box, and two levels would do; more levels
-are for other problems and for nodes at which no vertex is good.
+They are the tensor product of equidistant levels along the axes of the box of controls. For a drift that is affine in u
+and a sigma without u the best control is a vertex of the box, and three levels are enough. Otherwise it may lie
+anywhere in the box, and there are as many levels as `MOST` candidates allow.
 
 With more controls the tensor product is too large. Then there is one candidate for each direction p in which grad V
-may point: the control with the largest p . f(x, u), found axis by axis, which is exact for an affine drift. Their
-number depends on n and their cost is linear in m.
+may point: the control with the largest p . f(x, u), found axis by axis, which is exact for an affine drift and a sigma
+without u. Their number depends on n and their cost is linear in m.
 """
 
 from __future__ import annotations
@@ -17,20 +17,37 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.problem import ReachAvoidProblem, is_control_affine
 
-MOST = 32
-"""The largest number of candidates in a tensor product: three controls have 27 with three levels."""
+FEW = 32
+"""The largest number of candidates in a tensor product where vertices are enough: three controls have 27."""
+
+MOST = {1: 128, 2: 128, 3: 32}
+"""The largest number of candidates in a tensor product where they are not, by the number of states."""
+
+LEVELS = 33
+"""The largest number of levels that is chosen for a control."""
 
 SWEEPS = 2
 """Number of times that every axis of the control is improved with the others held."""
 
 
-def candidates(problem: ReachAvoidProblem, x: np.ndarray, spacing: np.ndarray, levels: int) -> np.ndarray:
-    """Controls (K, M, m), in SI units, at nodes x (M, n) of a mesh with spacing (n,), with `levels` along each axis."""
-    controls, m = problem.controls, problem.controls.dim
+def candidates(problem: ReachAvoidProblem, x: np.ndarray, spacing: np.ndarray, levels: int | None = None) -> np.ndarray:
+    """Controls (K, M, m), in SI units, at nodes x (M, n) of a mesh with spacing (n,).
+
+    Args:
+        problem: the physics.
+        x: the nodes.
+        spacing: the distances of nodes along each axis.
+        levels: the number of levels of each control; by default it follows from the problem.
+    """
+    controls, m, affine = problem.controls, problem.controls.dim, is_control_affine(problem)
+    most = FEW if affine else MOST[problem.states.dim]
+    if levels is None:
+        # An odd number has the middle of the box among the levels.
+        levels = next((k for k in range(LEVELS, 3, -2) if not affine and k**m <= most), 3)
     marks = np.linspace(-1.0, 1.0, levels)
-    if levels**m <= MOST:
+    if levels**m <= most:
         chosen = controls.denormalize(torch.tensor(list(product(marks, repeat=m)), dtype=torch.float64)).numpy()
         return np.broadcast_to(chosen[:, None], (len(chosen), len(x), m))
     points = torch.from_numpy(x)

@@ -46,7 +46,8 @@ class GridSolver:
         steps: number of steps in tau, at least 2; the default is the largest number of points.
         margin: how far the mesh goes beyond `problem.states` on each side, in SI units, one number for each axis. The
             default follows from drift, noise and horizon, see `pirl_rl.grid.mesh.default_margin`.
-        levels: number of levels of each control among the candidates, at least 2.
+        levels: number of levels of each control among the candidates, at least 2; the default follows from the
+            problem, see `pirl_rl.grid.candidates`.
         estimate: whether the problem is solved with half the points and steps, too, for an estimate of the error.
 
     Raises:
@@ -59,7 +60,7 @@ class GridSolver:
         points: int | Sequence[int] | None = None,
         steps: int | None = None,
         margin: Sequence[float] | None = None,
-        levels: int = 3,
+        levels: int | None = None,
         estimate: bool = True,
     ):
         n = problem.states.dim
@@ -70,8 +71,9 @@ class GridSolver:
         if len(self.points) != n or min(self.points) < 5:
             raise ArgumentError(f"points: expected {n} numbers >= 5, or one, got {points}")
         self.steps = max(self.points) if steps is None else steps
-        if self.steps < 2 or levels < 2:
-            raise ArgumentError(f"steps, levels: expected both >= 2, got {self.steps} and {levels}")
+        for name, number in (("steps", self.steps), ("levels", levels)):
+            if number is not None and number < 2:
+                raise ArgumentError(f"{name}: expected a number >= 2, got {number}")
         self.margin = default_margin(problem) if margin is None else np.array(margin, float)
         if self.margin.shape != (n,) or not (self.margin >= 0).all():
             raise ArgumentError(f"margin: expected {n} numbers >= 0, got {margin}")
