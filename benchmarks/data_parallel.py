@@ -24,6 +24,7 @@ from typing import Any
 import torch
 import torch.distributed
 
+from benchmarks.population import WARM_UP, Measured
 from benchmarks.record import save
 from benchmarks.time_to_accuracy import PLAIN
 from pirl_rl.assembly import make_trainer
@@ -31,15 +32,8 @@ from pirl_rl.commands.composition import compose
 from pirl_rl.learner import Gradient
 from pirl_rl.trainer import Trainer
 
-WARM_UP = 50
-"""The number of updates before those whose time is taken."""
-
 SHARED = ("env.num_envs", "collector.frames_per_batch", "collector.warmup_frames", "trainer.batch_size")
 """The settings of which each process has its share."""
-
-
-class Measured(Exception):
-    """All times are taken, so that the training can stop."""
 
 
 def average(gradient: Gradient) -> Gradient:
