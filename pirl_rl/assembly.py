@@ -35,6 +35,9 @@ Keys that take it: env.dt, env.substeps, trainer.updates, loss.hjb_probes and th
 UPDATES_PER_DIMENSION, MOST_UPDATES = 3_500, 20_000
 """The number of updates that is chosen for each dimension of (tau, x), and the largest that is chosen."""
 
+MOST_COORDINATES = 1_400_000
+"""The largest number of updates times states that is chosen: with a hundred states each update takes long."""
+
 PATHS = {
     ("success", "episodes"): (10_000, 1_000),
     ("calibration", "rollouts"): (256, 16),
@@ -185,9 +188,10 @@ def choose_time_steps(config: DictConfig, problem: ReachAvoidProblem) -> None:
 
 
 def choose_updates(config: DictConfig, problem: ReachAvoidProblem) -> None:
-    """Replace `auto` in trainer.updates by a number, which grows with the dimensions of V(tau, x) up to a limit."""
+    """Replace `auto` in trainer.updates by a number, which grows with the dimensions of V(tau, x) up to two limits."""
     if config.trainer.get("updates") == AUTO:
-        config.trainer.updates = min(UPDATES_PER_DIMENSION * (problem.states.dim + 1), MOST_UPDATES)
+        n = problem.states.dim
+        config.trainer.updates = min(UPDATES_PER_DIMENSION * (n + 1), MOST_UPDATES, max(1, MOST_COORDINATES // n))
 
 
 def choose_paths(config: DictConfig, problem: ReachAvoidProblem) -> None:

@@ -45,6 +45,8 @@ class Learner:
         actor_every: the number of critic updates for each update of the actor and the target networks, d_up in the
             paper.
         polyak: the rate, in (0, 1], at which the target networks follow the networks.
+        target_warmup: a number w >= 0. The rate of update j of the target networks, counted from 0, is at least
+            w/(w + j), so that V travels through the horizon within the first updates.
         compile: whether the losses are compiled. Where that fails, as without a C++ compiler, they run eagerly after
             one warning.
 
@@ -60,6 +62,7 @@ class Learner:
         decay: Literal["cosine", "constant"] = "cosine",
         actor_every: int = 2,
         polyak: float = 0.005,
+        target_warmup: int = 0,
         compile: bool = True,
     ):
         if decay not in ("cosine", "constant"):
@@ -73,6 +76,9 @@ class Learner:
             )
         self.loss = loss
         self.learning_rate, self.decay, self.actor_every = learning_rate, decay, actor_every
+        if target_warmup < 0:
+            raise ArgumentError(f"learner.target_warmup: expected a number >= 0, got {target_warmup}")
+        self.polyak, self.target_warmup = polyak, target_warmup
         self.targets = SoftUpdate(loss, tau=polyak)
         self.critic_optimizers = optimizers(loss.qvalue_network_params, learning_rate, optimizer)
         self.actor_optimizers = optimizers(loss.actor_network_params, learning_rate, optimizer)
@@ -119,7 +125,7 @@ class Learner:
         if k % self.actor_every == 0:
             if self.train_actor:
                 self.step_actor(self._differentiated("actor", batch), k)
-            self.targets.step()
+            self.step_targets(k)
         return {**terms, "loss_actor": self.loss_actor}
 
     # The next three are the parts of an update around the losses, which a population evaluates for all its members.
@@ -152,6 +158,15 @@ class Learner:
         _check(loss, {"loss_actor": loss}, k + 1)
         _descend(self.actor_optimizers, self.loss.actor_network_params, gradient)
         self.loss_actor = loss
+
+    def step_targets(self, k: int) -> None:
+        """Move the target networks towards the networks, in update `k`."""
+        self.targets.eps = 1 - max(self.polyak, self._early_rate(k // self.actor_every))
+        self.targets.step()
+
+    def _early_rate(self, count: int) -> float:
+        """The least rate of the target networks after a number of their updates."""
+        return self.target_warmup / (self.target_warmup + count) if self.target_warmup else 0.0
 
     def rate(self, decay: float) -> float:
         """The learning rate at a progress of its decay in [0, 1]."""

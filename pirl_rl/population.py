@@ -133,7 +133,7 @@ class Population:
                     if index in terms and gradients:
                         learner.step_actor(gradients[within[i]][i], k)
                     if index in terms:
-                        learner.targets.step()
+                        learner.step_targets(k)
         rows = []
         for index, learner, own in zip(due, learners, batches, strict=True):
             if index in self._active():

@@ -178,6 +178,21 @@ def test_a_frozen_actor_stays_while_critics_and_targets_move(tmp_path):
             assert torch.equal(entry, half[name]) == frozen, name
 
 
+def test_targets_follow_at_an_early_rate(tmp_path):
+    """With a warm-up of 4 the rates are 4/4, 4/5, 4/6 and so on, but at least polyak."""
+    trainer = small_trainer(tmp_path, "learner.target_warmup=4", "learner.polyak=0.45", "trainer.updates=16")
+    learner, rates = trainer.learner, []
+    step = learner.targets.step
+
+    def noted():
+        rates.append(1 - learner.targets.eps)
+        step()
+
+    learner.targets.step = noted
+    trainer.train()
+    assert rates == pytest.approx([1, 4 / 5, 4 / 6, 4 / 7, 4 / 8, 0.45, 0.45, 0.45])
+
+
 def test_a_stage_with_a_rate_of_its_own_has_the_whole_decay_in_it(tmp_path):
     """From its rate down a quarter wave; the stages beside it stay on the run's course."""
     stages = "stages=[{share: 1}, {share: 2, learning_rate: 0.01}, {share: 1}]"

@@ -227,13 +227,15 @@ def test_a_number_beside_auto_is_kept(capsys):
 
 
 @pytest.mark.parametrize(
-    ("experiment", "updates"), [("reach1d", 7_000), ("zermelo", 10_500), ("dubins", 14_000), ("quadrotor", 20_000)]
+    ("experiment", "updates"),
+    [("reach1d", 7_000), ("zermelo", 10_500), ("dubins", 14_000), ("quadrotor", 20_000), ("halfspace", 14_000)],
 )
 def test_the_length_of_a_run_follows_the_number_of_states(experiment, updates):
-    config = compose("train", [f"+experiment={experiment}"])
+    typed = [f"+experiment={experiment}", *(["env.problem.dim=100"] if experiment == "halfspace" else [])]
+    config = compose("train", typed)
     choose_updates(config, make_problem(config))
     assert config.trainer.updates == updates
-    config = compose("train", [f"+experiment={experiment}", "trainer.updates=7"])
+    config = compose("train", [*typed, "trainer.updates=7"])
     choose_updates(config, make_problem(config))
     assert config.trainer.updates == 7
 

@@ -54,9 +54,9 @@ def verdict(run: Run, simulator: Simulator | None = None) -> tuple[str, str]:
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory) -> Path:
-    """A training by the default recipe, with the networks after each tenth of it."""
+    """A training by the default recipe, with the networks after each hundredth of it."""
     folder = tmp_path_factory.mktemp("sound") / "run"
-    pirl_rl.train("zermelo", folder=folder, seed=20, checkpoint_every=UPDATES // 10, **NOTHING)
+    pirl_rl.train("zermelo", folder=folder, seed=20, checkpoint_every=UPDATES // 100, **NOTHING)
     return folder
 
 
@@ -68,7 +68,7 @@ TRAININGS = {
     "an actor that does not learn": ({"pirl.stages": [{"share": 1, "train_actor": False}]}, "succeeds more often"),
     "time steps ten times as long": ({"env.dt": 0.1, "env.substeps": 1}, "With shorter time steps"),
     "a weight of the residual that collapses V": ({"pirl.final": [1, 1_000, 0], "schedule.center": 0.1}, "V is "),
-    "a tenth of the updates": ({"updates": UPDATES // 10}, "V is wrong by"),
+    "a hundredth of the updates": ({"updates": UPDATES // 100}, "V is wrong by"),
     "a rate that is far too low": ({"learner.learning_rate": 1e-5}, "succeeds more often"),
 }
 
@@ -81,8 +81,8 @@ def test_a_spoilt_training_is_not_solved(name, tmp_path):
     assert reason in why
 
 
-def test_a_training_that_was_cut_at_a_tenth_is_not_solved(sound):
-    level, why = verdict(pirl_rl.load_run(sound, weights=f"weights-{UPDATES // 10:09d}.pt"))
+def test_a_training_that_was_cut_at_a_hundredth_is_not_solved(sound):
+    level, why = verdict(pirl_rl.load_run(sound, weights=f"weights-{UPDATES // 100:09d}.pt"))
     assert level in ("doubtful", "failed")
     assert "V is wrong by" in why
 
