@@ -55,6 +55,32 @@ def hamiltonian(solution: Solution, tau: Tensor, x: Tensor, controlled_noise: bo
     return value
 
 
+def expected_ahead(solution: Solution, tau: Tensor, x: Tensor, length: float) -> Objective:
+    """E V (*, N) after one Euler step with the action (*, N, m), by a cubature of degree three, Eq. (cubature).
+
+    The mean over y = x + f h +- sqrt(w h) sigma_k, for the w columns of sigma, has the mean and the covariance of the
+    step. It stays within the range of V where a second derivative would not: next to a face V may change within one
+    step, and there the learned curvature may be of any size and sign.
+
+    Args:
+        solution: gives V, with its values in A and B, and the problem.
+        tau: times to go (N,), in s.
+        x: states (N, n).
+        length: h in s; it is shortened to tau.
+    """
+    problem, h = solution.problem, tau.clamp(max=length)
+
+    def value(action: Tensor) -> Tensor:
+        u, shape = problem.controls.denormalize(action), action.shape[:-1]
+        y = x.expand(*shape, -1)
+        sigma = problem.diffusion(y, u).movedim(-1, 0)
+        spread = sigma * (len(sigma) * h).sqrt().unsqueeze(-1)
+        ends = y + problem.drift(y, u) * h.unsqueeze(-1) + torch.cat([spread, -spread])
+        return solution.value((tau - h).expand(ends.shape[:-1]), ends).mean(0)
+
+    return value
+
+
 def value_ahead(
     solution: Solution, simulator: Simulator, tau: Tensor, x: Tensor, steps: int, flow: Flow | None = None
 ) -> Objective:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pirl_rl import Box, ReachAvoidProblem
 from pirl_rl.actor_rules import BestControl, Hamiltonian
-from pirl_rl.ascent import ascend, hamiltonian, improved, value_ahead
+from pirl_rl.ascent import ascend, expected_ahead, hamiltonian, improved, value_ahead
 from pirl_rl.errors import ArgumentError
 from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.problem import has_controlled_noise
@@ -60,6 +60,38 @@ def test_the_hamiltonian_is_the_part_of_the_residual_that_depends_on_the_control
     one, other = (2 * torch.rand(len(x), 3) - 1 for _ in range(2))
     residuals = [solution.residual(tau, x, problem.controls.denormalize(action)) for action in (one, other)]
     assert torch.allclose(objective(one) - objective(other), residuals[0] - residuals[1], atol=1e-5)
+
+
+class Quadratic:
+    """V = tau + x' M x / 2 in place of learned networks."""
+
+    M = torch.tensor([[0.3, 0.1], [0.1, -0.2]])
+
+    def __init__(self, problem: ReachAvoidProblem):
+        self.problem = problem
+
+    def value(self, tau: Tensor, x: Tensor) -> Tensor:
+        return tau + (x @ self.M * x).sum(-1) / 2
+
+
+def test_the_cubature_is_exact_for_a_quadratic_value():
+    """E V = tau - h + m' M m / 2 + h Tr(sigma' M sigma) / 2 with m = x + f h, where h is at most tau."""
+    problem, (tau, x) = Steered(controlled=True), points(Steered(), 20)
+    action = 2 * torch.rand(3, 20, 3) - 1
+    u, h = problem.controls.denormalize(action), tau.clamp(max=0.3)
+    y = x.expand(3, -1, -1)
+    mean, sigma = y + problem.drift(y, u) * h.unsqueeze(-1), problem.diffusion(y, u)
+    trace = (sigma * (Quadratic.M @ sigma)).sum((-2, -1))
+    expected = Quadratic(problem).value(tau - h, mean) + h * trace / 2
+    found = expected_ahead(Quadratic(problem), tau, x, 0.3)(action)  # type: ignore[arg-type]
+    assert torch.allclose(found, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("problem", "levels", "cubature"), [(Reach1D(), 2, False), (Steered(True), 5, True)])
+def test_what_follows_from_the_problem(problem, levels, cubature):
+    rule = BestControl(problem, Simulator(problem, 0.1))
+    assert (rule.levels, rule.cubature) == (levels, cubature)
+    assert BestControl(problem, Simulator(problem, 0.1), steps=2).levels == 5
 
 
 @pytest.mark.parametrize("controlled", [False, True])
@@ -184,7 +216,7 @@ def test_masked_points_do_not_count():
 def test_what_the_rule_refuses():
     with pytest.raises(ArgumentError, match="steps >= 0, levels >= 2 and budget >= 1, got 0, 1 and 8192"):
         BestControl(Reach1D(), Simulator(Reach1D(), 0.1), levels=1)
-    with pytest.raises(ArgumentError, match="budget >= 1, got 0, 5 and 0"):
+    with pytest.raises(ArgumentError, match="budget >= 1, got 0, 2 and 0"):
         BestControl(Reach1D(), Simulator(Reach1D(), 0.1), budget=0)
     with pytest.raises(ArgumentError, match=r"expected critic\.action_input=false"):
         BestControl(Reach1D(), Simulator(Reach1D(), 0.1)).check(Critic(Reach1D(), action_input=True))

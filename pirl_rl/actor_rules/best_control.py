@@ -10,11 +10,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from pirl_rl.actor_rules.base import ActorRule
-from pirl_rl.ascent import Flow, Objective, hamiltonian, improved, value_ahead
+from pirl_rl.ascent import Flow, Objective, expected_ahead, hamiltonian, improved, value_ahead
 from pirl_rl.errors import ArgumentError
 from pirl_rl.networks import Critic
 from pirl_rl.operators import masked_mean
-from pirl_rl.problem import ReachAvoidProblem, has_controlled_noise
+from pirl_rl.problem import ReachAvoidProblem, has_controlled_noise, is_control_affine, noise_channels
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
@@ -29,6 +29,10 @@ class BestControl(ActorRule):
     vanish where the tanh is saturated at the wrong bound: unlike a gradient of the Hamiltonian in u, the rule
     corrects such an action.
 
+    Where sigma depends on u, E V after one control step takes the place of the Hamiltonian, divided by dt, see
+    `pirl_rl.ascent.expected_ahead`: next to faces the Hessian of a network may have the wrong sign. With more than 64
+    noise channels times controls it would be too dear, and the Hamiltonian stays.
+
     The Hamiltonian is the limit of a control that is never held. Where a control step is long, as with fewer than a
     hundred of them in the horizon, V after `steps` noise-free control steps takes its place, divided by dt: the first
     step with the candidate, the others with the policy, the rollout algorithm of D. Bertsekas (Rollout, Policy
@@ -41,7 +45,7 @@ class BestControl(ActorRule):
         simulator: simulates the control steps.
         steps: the number of control steps ahead; 0 takes the Hamiltonian.
         levels: the number of levels of each coordinate of the control among the candidates, bounds included; at least
-            2. Two levels find the maximum where the drift is affine in u and sigma does not depend on u.
+            2. None takes two where the Hamiltonian is affine in u, so that they hold its maximum, and else five.
         budget: the largest number of points times controls; of more points the first are taken, so that an update of
             the actor does not cost more with more controls.
 
@@ -54,15 +58,18 @@ class BestControl(ActorRule):
         problem: ReachAvoidProblem,
         simulator: Simulator,
         steps: int = 0,
-        levels: int = 5,
+        levels: int | None = None,
         budget: int = 8_192,
     ):
+        if levels is None:
+            levels = 2 if steps == 0 and is_control_affine(problem) else 5
         if steps < 0 or levels < 2 or budget < 1:
             raise ArgumentError(
                 f"actor_rule: expected steps >= 0, levels >= 2 and budget >= 1, got {steps}, {levels} and {budget}"
             )
         self.simulator, self.steps, self.levels, self.budget = simulator, steps, levels, budget
         self.controlled_noise, self.compiles_whole = has_controlled_noise(problem), steps == 0
+        self.cubature = self.controlled_noise and noise_channels(problem) * problem.controls.dim <= 64
         self.flow: Flow = simulator.flow
 
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
@@ -75,7 +82,7 @@ class BestControl(ActorRule):
             best, weight = improved(objective, action, torch.linspace(-1, 1, self.levels).to(action))
         # pi = tanh(z) is 2 sigmoid(2 z) - 1, so that 2 z is the logit of (1 + pi)/2.
         entropy = torch.nn.functional.binary_cross_entropy_with_logits(2 * logits, (1 + best) / 2, reduction="none")
-        duration = self.simulator.dt if self.steps else 1.0
+        duration = self.simulator.dt if self.steps or self.cubature else 1.0
         loss = solution.problem.horizon / duration * (weight * entropy).sum(-1)
         mask = points["mask"][:count] if "mask" in points.keys() else torch.ones_like(loss, dtype=torch.bool)
         return -masked_mean(loss, mask)
@@ -83,6 +90,8 @@ class BestControl(ActorRule):
     def _objective(self, solution: Solution, tau: Tensor, x: Tensor) -> Objective:
         if self.steps:
             return value_ahead(solution, self.simulator, tau, x, self.steps, self.flow)
+        if self.cubature:
+            return expected_ahead(solution, tau, x, self.simulator.dt)
         return hamiltonian(solution, tau, x, self.controlled_noise)
 
     def check(self, critic: Critic, exploration_noise: float | None = None) -> None:
