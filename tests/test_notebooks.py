@@ -24,7 +24,7 @@ SHORT = {
     "SETTINGS = '+experiment=reach1d compile=false check=false pirl.final=[1,1,10] env.dt=0.05 env.num_envs=256 "
     "collector.frames_per_batch=10240 collector.warmup_frames=10240 evaluation.calibration.rollouts=64 "
     "evaluation.success.episodes=1000'",
-    "04_evidence": "UPDATES, COMPILE, EPISODES, STATES, ROLLOUTS = 450, False, 1_000, 40, 32\n"
+    "04_evidence": "UPDATES, COMPILE, EPISODES, STATES, ROLLOUTS = 700, False, 1_000, 40, 32\n"
     "PROOF = {'cells': 24, 'steps': 24}\n"
     "MORE = {'check': False, 'report': False, 'env.dt': 0.08, 'env.substeps': 1, 'env.num_envs': 1_024, "
     "'collector.frames_per_batch': 20_480, 'collector.warmup_frames': 20_480, 'collector.buffer_size': 40_960, "
@@ -72,7 +72,7 @@ def test_notebook_executes(path, tmp_path, monkeypatch):
 
     Schedules: candidates of a few hundred updates have 0.05 to 0.11, an untrained critic, see above, twice the limit.
 
-    Evidence: after 450 updates the learned policy succeeds with more than 0.9 from most states. A critic that is right
+    Evidence: after 700 updates the learned policy succeeds with more than 0.9 from most states. A critic that is right
     has the noise of 128 rollouts, 0.02 on average, and an untrained one, near 0.5, is off by 0.4.
     """
     if path.stem == "02_drift" and not MODEL.exists():
