@@ -183,10 +183,10 @@ class MatrixProducts:
     def update(self) -> None:
         self.count += 1
         with torch.no_grad():
-            for count in (self.transitions, self.points, self.boundary):
+            for count in filter(None, (self.transitions, self.points, self.boundary)):
                 _through(self.actor, count)
             _through(self.critics, self.transitions)
-        for count in (self.transitions, self.rows, self.boundary):
+        for count in filter(None, (self.transitions, self.rows, self.boundary)):
             _through(self.critics, count).sum().backward()
         if self.count % 2 == 0:
             _through(self.actor, self.transitions).sum().backward()

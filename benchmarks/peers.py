@@ -4,9 +4,12 @@
 
 An update draws a batch from the replay buffer, takes a step of Adam for two critics and, every second time, one for the
 actor and one of the target networks. Widths, batch size, and rates are equal. TorchRL's loop is that of its TD3 script:
-`TD3Loss`, `SoftUpdate` and Adam, run eagerly. A played step is one control step of one path, with its policy, noise and
-storage in the replay buffer. Stable-Baselines3 plays the Gymnasium view of the same problem: one environment, which is
-its default, or 64 paths of the vector environment. The variants take turns, and rates are medians over the rounds.
+`TD3Loss`, `SoftUpdate` and Adam, run eagerly. "matrix products" are those of an update alone, forward and backward,
+without activations, samplers and optimisers: the floor of this machine for everything that runs through torch.
+
+A played step is one control step of one path, with its policy, noise and storage in the replay buffer.
+Stable-Baselines3 plays the Gymnasium view of the same problem: one environment, which is its default, or 64 paths of
+the vector environment. The variants take turns, and rates are medians over the rounds.
 """
 
 from __future__ import annotations
@@ -28,6 +31,7 @@ from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import SoftUpdate, TD3Loss
 
+from benchmarks.learner import MatrixProducts, Shape
 from benchmarks.record import save
 from pirl_rl.assembly import make_trainer
 from pirl_rl.commands.composition import compose
@@ -151,6 +155,17 @@ def update_sb3(trainer: Trainer) -> Callable[[int], None]:
     return lambda count: model.train(count, BATCH)
 
 
+def products(trainer: Trainer) -> Callable[[int], None]:
+    shape = Shape("TD3", trainer.learner.loss.problem, CRITIC, BATCH, collocation=0, boundary=0)
+    alone = MatrixProducts(shape)
+
+    def updates(count: int) -> None:
+        for _ in range(count):
+            alone.update()
+
+    return updates
+
+
 def play_ours(trainer: Trainer) -> Callable[[], int]:
     def play() -> int:
         before = trainer.collector.buffer.write_count
@@ -208,6 +223,7 @@ def measure(experiment: str, rounds: int, updates: int) -> dict[str, dict[str, f
         "pirl_rl": counted(update_ours(trainer)),
         "TorchRL, eager": counted(update_torchrl(trainer)),
         "Stable-Baselines3": counted(update_sb3(trainer)),
+        "matrix products": counted(products(trainer)),
     }
     playing: dict[str, Callable[[], float]] = {
         "pirl_rl, environment": step_ours(trainer),
