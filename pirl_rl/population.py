@@ -216,8 +216,9 @@ class StackedLosses:
             if "vmap" not in str(error):
                 raise
             raise ArgumentError(
-                "trainer.seeds: a function of the problem cannot be evaluated for several members at once "
-                f"({str(error).partition(chr(10))[0]}); train them one after another with -m seed=0,1"
+                "trainer.seeds, or population of the outer loop: a function of the problem cannot be evaluated for "
+                f"several members at once ({str(error).partition(chr(10))[0]}); train them one after another, with "
+                "-m seed=0,1 or population=false"
             ) from error
         own = ({name: values[index] for name, values in terms.items()} for index in range(len(losses)))
         return list(zip(loss, own, zip(*gradient, strict=True), strict=True))  # type: ignore[arg-type]

@@ -154,7 +154,7 @@ def test_a_problem_that_cannot_be_mapped_is_refused_by_name(tmp_path):
     config = small_config(*PHYSICS)
     members = [make_trainer(config.copy(), tmp_path / str(seed), problem=Branches()) for seed in (0, 1)]
     with pytest.raises(
-        ArgumentError, match=r"trainer\.seeds: a function of the problem cannot be evaluated .* -m seed=0,1"
+        ArgumentError, match=r"trainer\.seeds, .*: a function of the problem cannot be evaluated .* -m seed=0,1"
     ):
         population(members).train()
 

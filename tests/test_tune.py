@@ -73,6 +73,8 @@ def test_command_line(cli, trained, tmp_path):
         (["rounds=0"], "rounds: expected an integer >= 1, got 0"),
         (["candidates=x"], "candidates: expected int, got 'x'"),
         (["extra_rounds=-1"], "extra_rounds"),
+        (["population=3"], "population: expected bool"),
+        (["population=true", "parallel=2"], "parallel: expected 1 with population=true"),
         (["updats=3"], "updats"),
         (["trainer.log_every=0"], "trainer.log_every"),
         (["trainer.updates=3"], "trainer.updates=3: expected no trainer.updates here"),

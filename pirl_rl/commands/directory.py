@@ -7,19 +7,59 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
+from pirl_rl.assembly import make_trainer
 from pirl_rl.commands.console import outcome
 from pirl_rl.commands.methods import method_of
 from pirl_rl.commands.report import draw_again
-from pirl_rl.continuation import start_from
+from pirl_rl.configuration import save_config
+from pirl_rl.continuation import restore, start_from
 from pirl_rl.errors import CheckpointError, ConfigError
 from pirl_rl.evaluation import lines_of, meanings_of
 from pirl_rl.figures import draw_run
 from pirl_rl.lock import locked
+from pirl_rl.machine import record_session
+from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.reports.meanings import TRAINING
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.trainer import Trainer
+
+
+def begin(
+    config: DictConfig, folder: Path, overrides: Sequence[str], trust: Sequence[str], problem: ReachAvoidProblem
+) -> Trainer:
+    """The trainer of a new run, whose configuration and overrides are saved in its directory.
+
+    Raises:
+        PirlError: if the configuration cannot be built, or `start` does not fit it.
+    """
+    trainer = make_trainer(config, folder, trust, problem)
+    if config.start is not None:
+        take_start(trainer, config)
+    # The configuration comes last: a directory with it counts as begun, and must tell its overrides.
+    OmegaConf.save(list(overrides), RunDirectory(folder).overrides)
+    save_config(config, folder)
+    record_session(RunDirectory(folder), overrides, trainer.solution.device)
+    return trainer
+
+
+def reopen(config: DictConfig, folder: Path, arguments: Sequence[str], trust: Sequence[str]) -> Trainer:
+    """The trainer of a run that was begun, at its last checkpoint, or at update 0 without one.
+
+    Raises:
+        PirlError: if the configuration cannot be built, or the checkpoint does not fit it.
+    """
+    trainer = make_trainer(config, folder, trust)
+    if RunDirectory(folder).last.exists():
+        restore(trainer)
+    else:
+        print("resume: the run has no checkpoint yet and starts again at update 0", flush=True)
+        if config.get("start") is not None:
+            take_start(trainer, config)
+    save_config(config, folder)
+    record_session(RunDirectory(folder), arguments, trainer.solution.device)
+    return trainer
 
 
 def take_start(trainer: Trainer, config: DictConfig) -> None:

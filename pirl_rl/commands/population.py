@@ -17,15 +17,12 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from pirl_rl import checkpoint
-from pirl_rl.assembly import make_trainer
 from pirl_rl.building import convert
-from pirl_rl.commands.directory import new_directory, show, take_start
+from pirl_rl.commands.directory import begin, new_directory, reopen, show
 from pirl_rl.configuration import load_config, save_config
-from pirl_rl.continuation import restore
 from pirl_rl.errors import ConfigError, DivergenceError
 from pirl_rl.files import replacing
 from pirl_rl.lock import locked
-from pirl_rl.machine import record_session
 from pirl_rl.population import Population
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.run_directory import RunDirectory
@@ -67,16 +64,11 @@ def train_population(
         for name, own in zip(member_names(config), settings, strict=True):
             path = folder / name
             stack.enter_context(new_directory(path))
-            configs.append(_member_config(config, own))
-            trainers.append(make_trainer(configs[-1], path, trust, problem))
-            if config.start is not None:
-                take_start(trainers[-1], configs[-1])
-            numbers.append(checkpoint.global_rng_states())
             typed = [text for text in overrides if text.partition("=")[0].lstrip("+") not in (SEEDS, *own)]
             typed += [f"{key}={_typed(value)}" for key, value in own.items()]
-            OmegaConf.save(typed, RunDirectory(path).overrides)
-            save_config(configs[-1], path)
-            record_session(RunDirectory(path), typed, trainers[-1].solution.device)
+            configs.append(_member_config(config, own))
+            trainers.append(begin(configs[-1], path, typed, trust, problem))
+            numbers.append(checkpoint.global_rng_states())
         OmegaConf.save(list(overrides), RunDirectory(folder).overrides)
         save_config(config, folder)
         return _train(Population(trainers, numbers), configs, folder, trust)
@@ -100,13 +92,8 @@ def resume_population(
             path = folder / name
             stack.enter_context(locked(RunDirectory(path)))
             configs.append(load_config(path))
-            trainers.append(make_trainer(configs[-1], path, trust))
-            if RunDirectory(path).last.exists():
-                restore(trainers[-1])
-            elif configs[-1].get("start") is not None:
-                take_start(trainers[-1], configs[-1])
+            trainers.append(reopen(configs[-1], path, [f"resume={folder.name}"], trust))
             numbers.append(checkpoint.global_rng_states())
-            record_session(RunDirectory(path), [f"resume={folder.name}"], trainers[-1].solution.device)
         return _train(Population(trainers, numbers), configs, folder, trust)
 
 

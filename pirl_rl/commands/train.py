@@ -21,8 +21,9 @@ Examples:
 
 from __future__ import annotations
 
+import contextlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import hydra
@@ -30,23 +31,22 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from pirl_rl.assembly import make_problem, make_trainer
+from pirl_rl.assembly import make_problem
 from pirl_rl.commands.catalogue import choices
 from pirl_rl.commands.check import check_before_training
 from pirl_rl.commands.composition import check_overrides, drop_leftovers, register
 from pirl_rl.commands.console import named_modules, override, quiet_libraries, reported
-from pirl_rl.commands.directory import new_directory, refuse_files, show, take_start
+from pirl_rl.commands.directory import begin, new_directory, refuse_files, reopen, show
 from pirl_rl.commands.methods import check_method
 from pirl_rl.commands.population import resume_population, train_population
 from pirl_rl.commands.solve import solve
-from pirl_rl.configuration import CONF, PACKAGE, load_config, save_config
-from pirl_rl.continuation import restore
+from pirl_rl.configuration import CONF, PACKAGE, load_config
 from pirl_rl.errors import INTERRUPTED, ConfigError
 from pirl_rl.lock import locked
-from pirl_rl.machine import record_session
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.progress import announce, helped
 from pirl_rl.run_directory import RunDirectory
+from pirl_rl.trainer import Trainer
 
 NOTHING_NAMED = """error: nothing to train was named, expected one of
   python -m pirl_rl.train +experiment=own env.problem._target_=my_module.MyProblem
@@ -110,28 +110,37 @@ def train_new(
         PirlError: if the configuration cannot be built, or training diverges or is interrupted.
     """
     with new_directory(folder):
-        # Modules that the user names are trusted; those that a run directory names are not, since it may be foreign.
-        check_method(config, overrides)
-        trust = [*config.trust, *named_modules(overrides), *trust]
-        drop_leftovers(config, overrides, trust)
-        problem = make_problem(config, trust) if problem is None else problem
-        if config.check:
-            announce("checking the problem")
-            check_before_training(config, problem)
+        trust, problem = prepare(config, overrides, trust, problem)
         if config.trainer.get("seeds") is not None:
             return train_population(config, folder, overrides, trust, problem)
         if config.grid is not None:
             return solve(config, folder, overrides, trust, problem)
-        trainer = make_trainer(config, folder, trust, problem)
-        if config.start is not None:
-            take_start(trainer, config)
-        # The configuration comes last: a directory with it counts as begun, and must tell its overrides.
-        OmegaConf.save(overrides, RunDirectory(folder).overrides)
-        save_config(config, folder)
-        record_session(RunDirectory(folder), overrides, trainer.solution.device)
+        trainer = begin(config, folder, overrides, trust, problem)
         summary = trainer.train()
         show(trainer, summary, config, trust)
         return summary
+
+
+def prepare(
+    config: DictConfig, overrides: Sequence[str], trust: Sequence[str] = (), problem: ReachAvoidProblem | None = None
+) -> tuple[list[str], ReachAvoidProblem]:
+    """Check the configuration of a new run and its problem; arguments are those of `train_new`.
+
+    Returns:
+        The modules outside the package that the configuration may name, and the problem.
+
+    Raises:
+        PirlError: with what was expected and what was got.
+    """
+    # Modules that the user names are trusted; those that a run directory names are not, since it may be foreign.
+    check_method(config, overrides)
+    modules = [*config.trust, *named_modules(overrides), *trust]
+    drop_leftovers(config, overrides, modules)
+    problem = make_problem(config, modules) if problem is None else problem
+    if config.check:
+        announce("checking the problem")
+        check_before_training(config, problem)
+    return modules, problem
 
 
 def resume(folder: Path, overrides: Sequence[str]) -> None:
@@ -151,13 +160,30 @@ def go_on(folder: Path, overrides: Sequence[str], trust: Sequence[str] = ()) -> 
     Raises:
         PirlError: if the run cannot be resumed, or training diverges or is interrupted.
     """
-    run = RunDirectory(folder)
     config = load_config(folder)
+    if config.trainer.get("seeds") is not None:
+        RunDirectory(folder).refuse_links()
+        with locked(RunDirectory(folder)):
+            return resume_population(config, folder, overrides, [*named_modules(overrides), *trust])
+    with reopened(folder, overrides, trust) as (trainer, config, modules):
+        summary = trainer.train()
+        show(trainer, summary, config, modules)
+        return summary
+
+
+@contextlib.contextmanager
+def reopened(
+    folder: Path, overrides: Sequence[str], trust: Sequence[str] = ()
+) -> Iterator[tuple[Trainer, DictConfig, list[str]]]:
+    """Open a run to go on with it; arguments and errors are those of `go_on`.
+
+    Yields:
+        The trainer at its last checkpoint, the configuration, and the modules that it may name.
+    """
+    run, config = RunDirectory(folder), load_config(folder)
     run.refuse_links()
     with locked(run):
         config.trust = []
-        if config.trainer.get("seeds") is not None:
-            return resume_population(config, folder, overrides, [*named_modules(overrides), *trust])
         for text in overrides:
             if text.startswith("start="):
                 raise ConfigError(f"{text}: the run has begun already; start= is for new runs, without resume=")
@@ -167,18 +193,7 @@ def go_on(folder: Path, overrides: Sequence[str], trust: Sequence[str] = ()) -> 
         if config.get("grid") is not None:
             raise ConfigError(f"resume: expected a run that was trained, but {folder} holds the solution of a grid")
         modules = [*config.trust, *named_modules(overrides), *trust]
-        trainer = make_trainer(config, folder, modules)
-        if run.last.exists():
-            restore(trainer)
-        else:
-            print("resume: the run has no checkpoint yet and starts again at update 0", flush=True)
-            if config.get("start") is not None:
-                take_start(trainer, config)
-        save_config(config, folder)
-        record_session(run, [f"resume={folder.name}", *overrides], trainer.solution.device)
-        summary = trainer.train()
-        show(trainer, summary, config, modules)
-        return summary
+        yield reopen(config, folder, [f"resume={folder.name}", *overrides], modules), config, modules
 
 
 def _folders(arguments: Sequence[str]) -> list[Path]:

@@ -11,7 +11,8 @@ without training. The candidates have the method of the start, unless another on
     rounds      the number of rounds
     candidates  the number of candidates in each round
     updates     the number of updates of each candidate
-    parallel    the number of candidates that are trained at a time
+    parallel    the number of candidates that are trained at a time, each in a process of its own
+    population  true trains the candidates of a round side by side in one process, for devices with many cores
     out         the directory of the loop
     key=value   any other setting goes to the training of all candidates
 
@@ -54,6 +55,7 @@ from pirl_rl.outer_loop.processes import Processes
 from pirl_rl.outer_loop.record import Record
 from pirl_rl.outer_loop.redaction import redact
 from pirl_rl.outer_loop.report import markdown, write_report
+from pirl_rl.outer_loop.together import Together
 from pirl_rl.progress import helped
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.trainer import Trainer
@@ -61,7 +63,7 @@ from pirl_rl.trainer import Trainer
 COUNTS = {"rounds": 1, "extra_rounds": 0, "candidates": 1, "updates": 1, "parallel": 1}
 """Settings of the loop that are integers, with the smallest value of each."""
 
-OWN = ("start", "out", "advisor", *COUNTS)
+OWN = ("start", "out", "advisor", "population", *COUNTS)
 """Settings of the loop; all others belong to the training of its candidates."""
 
 PLANNED = ("schedule", "stages", "resume", "trainer.updates", "evaluation.final")
@@ -81,6 +83,10 @@ def tune(config: DictConfig) -> None:
     out = Path(HydraConfig.get().runtime.output_dir)
     with reported(out), _tidy(out), _resumable(out):
         counts = {name: _count(config, name) for name in COUNTS}
+        if convert(config.population, bool, "population") and counts["parallel"] > 1:
+            raise ConfigError(
+                f"parallel: expected 1 with population=true, which is one process, got {counts['parallel']}"
+            )
         train = [*_method(config, typed), *_for_training(typed), *_frequent_evaluation(config)]
         trust = [*config.trust, *named_modules(typed)]
         advisor = build(config.advisor, "advisor", trust)
@@ -102,7 +108,8 @@ def tune(config: DictConfig) -> None:
             del trainer  # frees its memory for the candidates
             parallel = counts.pop("parallel")
             settings = LoopSettings(**counts, start=path, train=train, trust=trust, final=final, seed=config.seed)
-            loop = Loop(settings, record, advisor, Processes(parallel, [lock]))
+            processes = Processes(parallel, [lock])
+            loop = Loop(settings, record, advisor, Together(processes) if config.population else processes)
             loop.run(record.history(baseline, tolerance(baseline)))
             _report(out, path)
 

@@ -17,7 +17,7 @@ from pirl_rl.run_directory import RunDirectory
 SETTINGS_FILE = "tune.yaml"
 """The file with the settings of the loop's first start."""
 
-CHANGEABLE = ("rounds", "extra_rounds", "parallel", "out")
+CHANGEABLE = ("rounds", "extra_rounds", "parallel", "population", "out")
 """Settings that may differ when the loop is started again."""
 
 LOCK = ".lock"

@@ -1,7 +1,8 @@
 """The record of a loop: the files of its directory, which hold its whole state.
 
 out/ tune.yaml context.md baseline.json tree.png report.md
-     rounds/NNN/ prompt.md answer.json plan.json results.json candidates/<name>/ candidates/<name>.log
+     rounds/NNN/ prompt.md answer.json plan.json results.json
+     rounds/NNN/candidates/ <name>/ <name>.log population.log
 """
 
 from __future__ import annotations
