@@ -143,5 +143,5 @@ def test_a_loop_with_populations_decides_as_one_with_processes(trained, tmp_path
     )
     assert len(first) == len(second) == 4
     for one, other in zip(first, second, strict=True):
-        values = [json.loads(path.read_text())["value_mse"] for path in (one, other)]
+        values = [json.loads(path.read_text())["td_loss"] for path in (one, other)]
         assert values[0] == pytest.approx(values[1], rel=1e-3)
