@@ -91,6 +91,7 @@ def test_a_new_rule_runs_eagerly_where_nothing_is_compiled(tmp_path, monkeypatch
     assert {*calls} == {"PIRLLoss.critic_loss", "ClippedSurrogate.__call__", "Simulator.flow"}
 
 
+@pytest.mark.slow
 def test_a_new_rule_without_a_compiler_on_the_path(tmp_path):
     """One warning, then both rules run eagerly to the end."""
     quick = ("+experiment=reach1d", "+debug=default", "evaluation.during=[]", "evaluation.final=[]")

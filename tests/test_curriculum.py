@@ -116,7 +116,7 @@ def test_resume_inside_a_stage_is_exact(stages, stop, end, tmp_path):
     assert_same(*ends)
 
 
-@pytest.mark.parametrize("collector", ["sync", "multi_async"])
+@pytest.mark.parametrize("collector", ["sync", pytest.param("multi_async", marks=pytest.mark.slow)])
 def test_a_stage_of_policy_gradients_follows_its_own_noise_alone(collector, tmp_path):
     trainer = small_trainer(tmp_path, *POLICY, f"collector={collector}", "collector.warmup_frames=128")
     seen = []

@@ -50,7 +50,13 @@ def assert_equal(ones: list[Trainer], others: list[Trainer], tolerance: float) -
 
 @pytest.mark.usefixtures("float64")
 @pytest.mark.parametrize(
-    "settings", [(), PHYSICS, TD3, PAPER, PROBES], ids=["default", "physics", "td3", "paper", "probes"]
+    "settings",
+    [
+        pytest.param((), id="default"),
+        pytest.param(PHYSICS, id="physics"),
+        *(pytest.param(TD3, id="td3", marks=pytest.mark.slow), pytest.param(PAPER, id="paper", marks=pytest.mark.slow)),
+        pytest.param(PROBES, id="probes"),
+    ],
 )
 def test_members_equal_runs_of_their_own(settings, tmp_path):
     """Networks, targets and logged losses after 20 updates, up to rounding in double precision."""

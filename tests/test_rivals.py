@@ -46,7 +46,7 @@ def test_a_car_that_cannot_stop_has_no_regulator():
         linear_quadratic(DubinsCar(), Simulator(DubinsCar(), 0.1), 0.0, 0)
 
 
-@pytest.mark.parametrize(("name", "calls"), [("ppo", 2_560), ("sac", 400)])
+@pytest.mark.parametrize(("name", "calls"), [pytest.param("ppo", 2_560, marks=pytest.mark.slow), ("sac", 400)])
 def test_learners_of_the_library_learn_to_reach(name, calls, monkeypatch):
     """Their policy comes nearer to the optimum of the one-dimensional benchmark than to its reverse.
 
