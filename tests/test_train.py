@@ -81,6 +81,15 @@ def test_every_experiment_trains(experiment, cli, tmp_path, monkeypatch):
     sys.modules.pop("my_module", None)
 
 
+@pytest.mark.parametrize("method", ["pirl", "grid"])
+def test_figures_and_report_can_be_left_out(method, cli, tmp_path):
+    settings = ("evaluation.final=[success]", "figures=false", f"method={method}")
+    code, text = cli("+experiment=reach1d", "+debug=default", *SMALL, *settings)
+    assert code == 0, text
+    assert not list(only_run(tmp_path).rglob("*.png"))
+    assert not list(only_run(tmp_path).rglob("*.html"))
+
+
 def test_without_arguments_it_says_what_it_needs(cli, tmp_path):
     code, text = cli()
     assert code == 1

@@ -88,13 +88,14 @@ def take_start(trainer: Trainer, config: DictConfig) -> None:
 
 
 def show(trainer: Trainer, summary: Mapping[str, float], config: DictConfig, trust: Sequence[str]) -> None:
-    """Print what a training has come to, and draw its figures and its report."""
+    """Print what a training has come to, and draw its figures and its report unless the configuration leaves them out."""
     assert trainer.folder is not None
     run = RunDirectory(trainer.folder)
     meanings = {"training": TRAINING} | meanings_of(trainer.final, trainer.solution.problem)
     print(outcome(lines_of(trainer.evidence), summary, meanings, config.get("verbose", False)))
-    for figure in draw_run(trainer.solution, run.metrics, run.figures, trainer.evidence):
-        print(f"figure   {figure}")
+    if config.get("figures", True):
+        for figure in draw_run(trainer.solution, run.metrics, run.figures, trainer.evidence):
+            print(f"figure   {figure}")
     if config.get("report", True):
         draw_again(run.path, trust, trainer.solution.problem)
     print(f"run      {run}")

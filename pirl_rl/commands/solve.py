@@ -75,8 +75,9 @@ def solve(
         file.write(json.dumps(statements_of(evidence) | summary, indent=2) + "\n")
     meanings = {"grid": GRID} | meanings_of(evaluators, problem)
     print(outcome(lines_of(evidence), summary, meanings, config.verbose))
-    for figure in draw_run(solution, run.metrics, run.figures, evidence):
-        print(f"figure   {figure}")
+    if config.figures:
+        for figure in draw_run(solution, run.metrics, run.figures, evidence):
+            print(f"figure   {figure}")
     if config.report:
         draw_again(folder, trust, problem)
     print(f"run      {run}")

@@ -22,5 +22,5 @@ def save_figures(figures: Mapping[str, Figure], folder: str | Path) -> list[Path
     paths = [Path(folder) / f"{name}.png" for name in figures]
     for path, figure in zip(paths, figures.values(), strict=True):
         with replacing(path, binary=True) as file:
-            figure.savefig(file, dpi=DPI, format="png", pil_kwargs={"optimize": True})
+            figure.savefig(file, dpi=DPI, format="png")
     return paths
