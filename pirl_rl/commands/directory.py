@@ -88,7 +88,7 @@ def take_start(trainer: Trainer, config: DictConfig) -> None:
 
 
 def show(trainer: Trainer, summary: Mapping[str, float], config: DictConfig, trust: Sequence[str]) -> None:
-    """Print what a training has come to, and draw its figures and its report unless the configuration leaves them out."""
+    """Print what a training has come to, and draw figures and report where the configuration asks for them."""
     assert trainer.folder is not None
     run = RunDirectory(trainer.folder)
     meanings = {"training": TRAINING} | meanings_of(trainer.final, trainer.solution.problem)
