@@ -1,0 +1,236 @@
+"""The default recipe on problems of several kinds that chose nothing of it, against the grid.
+
+    python benchmarks/own_problems.py [NAME ...] [--seed 50] [--out FOLDER] [--json FILE]
+
+Each is written as a user would write it, with constants that nothing was tuned on. V and the success of the learned
+policy are compared with the grid at 400 states with random times to go. States at which the grid expects an error of
+its own above 0.03 are left out. Monte Carlo plays 1,000 paths from each state. A run takes minutes; a finished one is
+loaded.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import pirl_rl
+from benchmarks.record import save
+from pirl_rl import Box, ReachAvoidProblem
+from pirl_rl.grid import GridSolver
+
+POINTS = {1: 801, 2: 161, 3: 81}
+"""The nodes of the grid along each axis, by the number of states."""
+
+STATES, ROLLOUTS, DOUBTFUL = 400, 1_000, 0.03
+
+
+def rows(*entries: Tensor) -> Tensor:
+    return torch.stack(entries, -1)
+
+
+def constant(x: Tensor, *matrix: list[float]) -> Tensor:
+    """The same matrix (n, w) at all states (*, n)."""
+    sigma = x.new_tensor(matrix)
+    return sigma.expand(*x.shape[:-1], *sigma.shape)
+
+
+class Servo(ReachAvoidProblem):
+    """Bring a motor with dry friction to rest near the middle; noise acts on the speed alone."""
+
+    horizon = 2.5
+    states, controls = Box([-1.5, -2.0], [1.5, 2.0]), Box([-1.5], [1.5])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        speed = x[..., 1]
+        return rows(speed, u[..., 0] - 0.6 * speed - 0.3 * torch.tanh(8 * speed))
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return constant(x, [0.0], [0.35])
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return rows(x[..., 0].abs() - 0.15, x[..., 1].abs() - 0.3)
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        return 1.2 - x[..., :1].abs()
+
+
+class Steering(ReachAvoidProblem):
+    """Drift towards a gate that must be met; noise is correlated, and the gain of the control grows away from 0."""
+
+    horizon = 2.0
+    states, controls = Box([-1.0, -1.0], [1.0, 1.0]), Box([-1.0], [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        gain = 2 * (0.3 + x[..., 0].square())
+        return rows(torch.full_like(gain, 0.8), gain * u[..., 0] - 0.5 * x[..., 1])
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return constant(x, [0.2, 0.0], [0.25, 0.25])
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return rows(0.8 - x[..., 0], x[..., 1].abs() - 0.3)
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        return 1 - x[..., 1:].abs()
+
+
+class Evader(ReachAvoidProblem):
+    """Keep away from a pursuer, who is slower; the states are the distance between both."""
+
+    objective = "invariance"
+    horizon = 3.0
+    states, controls = Box([-2.0, -2.0], [2.0, 2.0]), Box([-1.0, -1.0], [1.0, 1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return u - 0.7 * x / x.norm(dim=-1, keepdim=True).clamp(min=0.2)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return constant(x, [0.35, 0.0], [0.0, 0.35])
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        return x.norm(dim=-1) - 0.5
+
+
+class Gusty(ReachAvoidProblem):
+    """Reach a disc behind a rock in a box, with noise that grows with the control."""
+
+    horizon = 2.5
+    states, controls = Box([-1.5, -1.5], [1.5, 1.5]), Box([-1.0, -1.0], [1.0, 1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return u + 0.4 * rows(x[..., 1], -x[..., 0])
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.diag_embed(0.15 + 0.25 * u.abs())
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return (x - 0.8).norm(dim=-1) - 0.3
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        return torch.minimum(x.norm(dim=-1) - 0.35, 1.4 - x.abs().amax(-1))
+
+
+class TwoTanks(ReachAvoidProblem):
+    """Keep the levels of two tanks, of which one flows into the other, within bounds; noise grows with the level."""
+
+    objective = "invariance"
+    horizon = 4.0
+    states, controls = Box([0.1, 0.1], [1.0, 1.0]), Box([0.0, 0.0], [0.5, 0.5])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        flow = x.clamp(min=1e-3).sqrt()
+        return u + rows(-0.3 * flow[..., 0], 0.3 * flow[..., 0] - 0.35 * flow[..., 1])
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.diag_embed(0.05 + 0.2 * x)
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        return torch.cat([x - 0.2, 0.9 - x], -1)
+
+
+class Reservoir(ReachAvoidProblem):
+    """Let a stock with logistic growth and geometric noise recover before it collapses; the control harvests it."""
+
+    horizon = 5.0
+    states, controls = Box([0.0], [3.0]), Box([0.0], [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return 0.8 * x * (1 - x / 2) - u * x
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return (0.35 * x).unsqueeze(-1)
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return 2.4 - x
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        return x - 0.3
+
+
+class Slalom(ReachAvoidProblem):
+    """Steer a cart of constant speed between two rocks into a disc; the heading is periodic."""
+
+    horizon = 4.0
+    states = Box([-2.0, -1.0, -math.pi], [2.0, 1.0, math.pi], periodic=[2])
+    controls = Box([-2.0], [2.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return rows(x[..., 2].cos(), x[..., 2].sin(), u[..., 0])
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return constant(x, [0.15, 0.0, 0.0], [0.0, 0.15, 0.0], [0.0, 0.0, 0.2])
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return (x[..., :2] - x.new_tensor([1.5, 0.0])).norm(dim=-1) - 0.35
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        rocks = x.new_tensor([[-0.5, 0.4], [0.5, -0.4]])
+        return (x[..., None, :2] - rocks).norm(dim=-1).amin(-1) - 0.4
+
+
+PROBLEMS = {kind.__name__: kind for kind in (Servo, Steering, Evader, Gusty, TwoTanks, Reservoir, Slalom)}
+
+
+def truth(problem: ReachAvoidProblem) -> tuple[Tensor, Tensor, Tensor]:
+    """Times to go (N,), states (N, n) and the value (N,) of the grid."""
+    solution = GridSolver(problem, POINTS[problem.states.dim]).solve()
+    rng = torch.Generator().manual_seed(31_000)
+    x = problem.states.sample(10 * STATES, rng)
+    x = x[problem.interior(x)]
+    tau = problem.horizon * (0.1 + 0.9 * torch.rand(len(x), generator=rng))
+    sure = solution.error(tau, x) < DOUBTFUL
+    tau, x = tau[sure][:STATES], x[sure][:STATES]
+    return tau, x, solution.value(tau, x)
+
+
+def measure(name: str, seed: int, out: Path) -> dict[str, float]:
+    """Train a problem, or load its finished run, and compare it with the grid."""
+    problem, folder = PROBLEMS[name](), out / f"{name}-{seed}"
+    tau, x, value = truth(problem)
+    if (folder / "summary.json").exists():
+        run = pirl_rl.load_run(folder, problem=problem)
+    else:
+        run = pirl_rl.train(problem, folder=folder, seed=seed, report=False, **{"evaluation.during": []})
+    own, played = run.value(tau, x), run.monte_carlo(tau, x, rollouts=ROLLOUTS).probability
+    noise = (played * (1 - played) / ROLLOUTS).sqrt()
+    return {
+        "mse": (own - value).square().mean().item(),
+        "largest_error": (own - value).abs().max().item(),
+        "loss": (value - played).mean().item(),
+        "loss_error": noise.square().sum().sqrt().item() / len(x),
+        "largest_loss": (value - played).max().item(),
+        "gap": (own - played).abs().mean().item(),
+        "gap_noise": math.sqrt(2 / math.pi) * noise.mean().item(),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(PROBLEMS)}; all by default")
+    parser.add_argument("--seed", type=int, default=50)
+    parser.add_argument("--out", type=Path, default=Path("runs/own_problems"))
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    if unknown := {*arguments.names} - PROBLEMS.keys():
+        parser.error(f"expected names out of {', '.join(PROBLEMS)}, got {', '.join(sorted(unknown))}")
+    found: dict[str, Any] = {}
+    lines = [
+        "| Problem | MSE of V | Largest error | Loss of success | Largest loss | mean abs(V - MC) | of which noise |"
+    ]
+    lines.append("| --- | ---: | ---: | ---: | ---: | ---: | ---: |")
+    for name in arguments.names or PROBLEMS:
+        found[name] = row = measure(name, arguments.seed, arguments.out)
+        loss = f"{row['loss']:.4f} ± {row['loss_error']:.4f}"
+        numbers = f"{row['mse']:.1e} | {row['largest_error']:.2f} | {loss} | {row['largest_loss']:.2f}"
+        lines.append(f"| {name} | {numbers} | {row['gap']:.4f} | {row['gap_noise']:.4f} |")
+        save(arguments.json, {}, seed=arguments.seed, problems=found)
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
