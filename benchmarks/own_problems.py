@@ -1,4 +1,4 @@
-"""The default recipe on problems of several kinds that chose nothing of it, against the grid.
+"""The default recipe on problems of several kinds that had no part in its choice, against the grid.
 
     python benchmarks/own_problems.py [NAME ...] [--seed 50] [--out FOLDER] [--json FILE]
 
@@ -177,7 +177,7 @@ PROBLEMS = {kind.__name__: kind for kind in (Servo, Steering, Evader, Gusty, Two
 
 
 def truth(problem: ReachAvoidProblem) -> tuple[Tensor, Tensor, Tensor]:
-    """Times to go (N,), states (N, n) and the value (N,) of the grid."""
+    """Times to go (N,) in s, states (N, n) in the units of the problem, and the value (N,) of the grid."""
     solution = GridSolver(problem, POINTS[problem.states.dim]).solve()
     rng = torch.Generator().manual_seed(31_000)
     x = problem.states.sample(10 * STATES, rng)
