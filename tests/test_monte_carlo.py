@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from pirl_rl.evaluation.monte_carlo import ENTRIES, PATHS, monte_carlo, wilson_interval
+from pirl_rl.evaluation.monte_carlo import ENTRIES, PATHS, expected_deviation, monte_carlo, wilson_interval
 from pirl_rl.payoffs import LipschitzPayoff
 from pirl_rl.problems import HalfSpace, Reach1D, Safety1D
 
@@ -49,6 +49,15 @@ def test_wilson_coverage_is_nominal():
 def test_wilson_refuses(arguments):
     with pytest.raises(ValueError, match="wilson_interval"):
         wilson_interval(*arguments)
+
+
+@pytest.mark.parametrize("rollouts", [1, 8, 64])
+def test_expected_deviation_is_that_of_binomial_means(rollouts):
+    """Over 100,000 probabilities, 0 and 1 among them, the standard error of the sampled mean is at most 0.001."""
+    rng = torch.Generator().manual_seed(0)
+    p = torch.cat([torch.zeros(1000), torch.ones(1000), torch.rand(98_000, generator=rng)]).double()
+    mean = torch.binomial(torch.full_like(p, rollouts), p, generator=rng) / rollouts
+    assert expected_deviation(p, rollouts) == pytest.approx((mean - p).abs().mean().item(), abs=0.004)
 
 
 def test_reach1d_agrees_with_the_exact_value():

@@ -73,9 +73,10 @@ def test_grid_holds_values_where_it_says():
     solution = random_solution(Reach1D())
     grid = evaluate_on_grid(solution, taus=5, states=9)
     tau, x = torch.tensor([grid.tau[3]]).float(), torch.tensor([[grid.x[7]]]).float()
-    assert grid.value[7, 3] == pytest.approx(solution.raw_value(tau, x).item(), abs=1e-6)
+    assert grid.value[7, 3] == pytest.approx(solution.value(tau, x).item(), abs=1e-6)
     assert grid.control[0, 7, 3] == pytest.approx(solution.policy(tau, x).item(), abs=1e-6)
     assert grid.exact[7, 3] == pytest.approx(solution.problem.exact_value(tau, x).item(), abs=1e-6)
+    assert np.equal(grid.value[-1], 1).all()  # x = 2 is in the target, where V is 1 whatever the networks say
 
 
 def test_value_maps_share_limits_and_are_labelled():

@@ -45,6 +45,13 @@ def judged(solution, dt=0.02, **settings):
     return evidence, statements_of(evidence)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_few_paths_do_not_make_the_exact_solution_doubtful(seed):
+    """With eight paths from each state the noise is 0.11 on average, far above the error that would be doubtful."""
+    _, statements = judged(Known(HalfSpace()), rollouts=8, seed=seed)
+    assert statements["verdict"] == "solved"
+
+
 @pytest.mark.parametrize("problem", [Reach1D, Exit1D, HalfSpace])
 def test_the_exact_solution_is_solved(problem):
     evidence, statements = judged(Known(problem()))
@@ -122,6 +129,7 @@ GOOD = Measures(
     ahead=Difference(0.0, 0.01),
     finer=Difference(0.0, 0.01),
     gap=0.02,
+    gap_error=0.001,
     noise=0.018,
     gap_finer=0.02,
     noise_finer=0.018,
@@ -144,6 +152,7 @@ GOOD = Measures(
         ({"ahead": Difference(0.05, 0.03)}, None, ""),
         ({"ahead": None}, None, ""),
         ({"gap": 0.05}, "doubtful", "V is wrong by 0.047"),
+        ({"gap": 0.05, "gap_error": 0.02}, None, ""),
         ({"bias": Difference(-0.03, 0.005)}, "doubtful", "0.030 below Monte Carlo"),
         ({"bias": Difference(-0.03, 0.02)}, None, ""),
         ({"gap": 0.2}, "failed", "V is wrong by 0.20"),

@@ -133,7 +133,7 @@ def _played_error(
     tau, x = like(solution, tau, x)
     played = RolloutComparison.measure(solution, simulator, tau, x, ROLLOUTS, seed)
     gap = (played.raw_value - played.monte_carlo).abs()
-    mean, largest, noise = gap.mean().item(), gap.max().item(), expected_deviation(played.monte_carlo, ROLLOUTS)
+    mean, largest, noise = gap.mean().item(), gap.max().item(), expected_deviation(played.value, ROLLOUTS)
     return (
         {"error_mean": mean, "error_largest": largest, "error_noise": noise},
         f"The error itself, at {len(tau)} of the points inside: V is {mean:.3g} from Monte Carlo of the policy in the "

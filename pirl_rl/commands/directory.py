@@ -6,6 +6,7 @@ import contextlib
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -16,7 +17,7 @@ from pirl_rl.commands.report import draw_again
 from pirl_rl.configuration import save_config
 from pirl_rl.continuation import restore, start_from
 from pirl_rl.errors import CheckpointError, ConfigError
-from pirl_rl.evaluation import lines_of, meanings_of
+from pirl_rl.evaluation import Evidence, lines_of, meanings_of
 from pirl_rl.figures import draw_run
 from pirl_rl.lock import locked
 from pirl_rl.machine import record_session
@@ -90,14 +91,36 @@ def take_start(trainer: Trainer, config: DictConfig) -> None:
 def show(trainer: Trainer, summary: Mapping[str, float], config: DictConfig, trust: Sequence[str]) -> None:
     """Print what a training has come to, and draw figures and report where the configuration asks for them."""
     assert trainer.folder is not None
-    run = RunDirectory(trainer.folder)
     meanings = {"training": TRAINING} | meanings_of(trainer.final, trainer.solution.problem)
-    print(outcome(lines_of(trainer.evidence), summary, meanings, config.get("verbose", False)))
+    show_run(RunDirectory(trainer.folder), trainer.solution, trainer.evidence, summary, meanings, config, trust)
+
+
+def show_run(
+    run: RunDirectory,
+    solution: Any,
+    evidence: Mapping[str, Evidence],
+    summary: Mapping[str, float],
+    meanings: Mapping[str, Mapping[str, str]],
+    config: DictConfig,
+    trust: Sequence[str],
+) -> None:
+    """Print the outcome of a run, and draw figures and report where the configuration asks for them.
+
+    Args:
+        run: the directory, with the files of the finished run.
+        solution: the networks, or the solution of a grid, which has the same methods.
+        evidence: what the last evaluation found, by the names of the evaluators.
+        summary: the numbers of the run.
+        meanings: what these numbers mean, by group and name.
+        config: the configuration of the run.
+        trust: modules outside the package that the configuration may name.
+    """
+    print(outcome(lines_of(evidence), summary, meanings, config.get("verbose", False)))
     if config.get("figures", True):
-        for figure in draw_run(trainer.solution, run.metrics, run.figures, trainer.evidence):
+        for figure in draw_run(solution, run.metrics, run.figures, evidence):
             print(f"figure   {figure}")
     if config.get("report", True):
-        draw_again(run.path, trust, trainer.solution.problem)
+        draw_again(run.path, trust, solution.problem)
     print(f"run      {run}")
 
 

@@ -19,11 +19,9 @@ from pirl_rl.assembly import (
     make_grid_solver,
     make_problem,
 )
-from pirl_rl.commands.console import outcome
-from pirl_rl.commands.report import draw_again
+from pirl_rl.commands.directory import show_run
 from pirl_rl.configuration import save_config
-from pirl_rl.evaluation import evaluate, lines_of, meanings_of, metrics_of, statements_of
-from pirl_rl.figures import draw_run
+from pirl_rl.evaluation import evaluate, meanings_of, metrics_of, statements_of
 from pirl_rl.files import replacing
 from pirl_rl.machine import record_session
 from pirl_rl.problem import ReachAvoidProblem, check_problem
@@ -74,11 +72,5 @@ def solve(
     with replacing(run.summary) as file:
         file.write(json.dumps(statements_of(evidence) | summary, indent=2) + "\n")
     meanings = {"grid": GRID} | meanings_of(evaluators, problem)
-    print(outcome(lines_of(evidence), summary, meanings, config.verbose))
-    if config.figures:
-        for figure in draw_run(solution, run.metrics, run.figures, evidence):
-            print(f"figure   {figure}")
-    if config.report:
-        draw_again(folder, trust, problem)
-    print(f"run      {run}")
+    show_run(run, solution, evidence, summary, meanings, config, trust)
     return summary

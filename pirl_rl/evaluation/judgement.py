@@ -65,6 +65,7 @@ class Measures:
         ahead: look-ahead minus learned; None where it was not played.
         finer: success with shorter time steps minus that with those of the training.
         gap: the mean of |V - Monte Carlo|.
+        gap_error: the standard error of `gap`.
         noise: what `gap` would be for a perfect V.
         gap_finer, noise_finer: like `gap` and `noise`, with shorter time steps.
         bias: the mean of V - Monte Carlo, with its error.
@@ -86,6 +87,7 @@ class Measures:
     ahead: Difference | None
     finer: Difference
     gap: float
+    gap_error: float
     noise: float
     gap_finer: float
     noise_finer: float
@@ -102,6 +104,10 @@ class Measures:
     def error(self) -> float:
         """The mean error of V without the noise of Monte Carlo, whose squares add up."""
         return max(self.gap**2 - self.noise**2, 0.0) ** 0.5
+
+    def is_wrong(self, least: float) -> bool:
+        """Whether V is wrong by more than `least` on average, and not by chance."""
+        return self.error > least and self.gap - self.noise > ERRORS * self.gap_error
 
 
 def judge(m: Measures) -> list[Reason]:
@@ -136,7 +142,7 @@ def _failures(m: Measures):
             "V is the same at all states, but success is not.",
             "lower the weights of the HJB residual and of the boundary (pirl.final), or start them later",
         )
-    if m.error > LARGE_GAP:
+    if m.is_wrong(LARGE_GAP):
         yield Reason(
             "failed",
             f"V is wrong by {m.error:.2f} on average, measured by Monte Carlo of its own policy.",
@@ -145,7 +151,7 @@ def _failures(m: Measures):
 
 
 def _doubts(m: Measures):
-    if m.error <= LARGE_GAP and (m.error > GAP or m.bias.matters(BIAS)):
+    if not m.is_wrong(LARGE_GAP) and (m.is_wrong(GAP) or m.bias.matters(BIAS)):
         sign = "above" if m.bias.mean > 0 else "below"
         yield Reason(
             "doubtful",

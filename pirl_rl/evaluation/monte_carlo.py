@@ -74,12 +74,17 @@ def wilson_interval(successes: Array, trials: int, confidence: float = 0.95) -> 
     return lower(p), 1 - lower(1 - p)  # type: ignore[arg-type, return-value]
 
 
-def expected_deviation(mean: Tensor, rollouts: int) -> float:
-    """The mean |error| of Monte Carlo means (N,) of R rollouts, for normal errors: that of sqrt(2 p (1 - p) / (pi R)).
+def expected_deviation(probability: Tensor, rollouts: int) -> float:
+    """The mean of |S/R - p| over probabilities p (N,), where S is the number of successes in R independent rollouts.
 
-    p (1 - p) is estimated without bias, so that R is at least 2.
+    It is what the mean of |V - Monte Carlo| would be if p = V were right. The mean absolute deviation of a binomial
+    variable is E|S - R p| = 2 k C(R, k) p^k (1 - p)^(R - k + 1) with k = floor(R p) + 1 (A. de Moivre 1730).
     """
-    return (2 * mean * (1 - mean) / (torch.pi * (rollouts - 1))).sqrt().mean().item()
+    p, total = probability.double(), torch.tensor(float(rollouts), dtype=torch.float64)
+    k = (total * p).floor().clamp(max=rollouts - 1) + 1
+    ways = torch.lgamma(total + 1) - torch.lgamma(k + 1) - torch.lgamma(total - k + 1)
+    likelihood = torch.exp(ways + torch.xlogy(k, p) + torch.xlogy(total - k + 1, 1 - p))
+    return (2 * k * likelihood / total).mean().item()
 
 
 def monte_carlo(

@@ -125,6 +125,7 @@ class Verdict:
 
         value = solution.value(tau, x).cpu().double()
         learned = play(solution.policy, self.rollouts)
+        gap = (value - learned).abs()
         finely = play(solution.policy, max(2, self.rollouts // 2), few, FINER)
         constant, action, random = play_open_loop(simulator, tau, x, OPEN_LOOP, self.seed)
         u = problem.controls.normalize(solution.policy(tau, x))
@@ -147,10 +148,11 @@ class Verdict:
                 over_constant=_difference(constant, learned),
                 ahead=ahead,
                 finer=_difference(finely, learned[few]),
-                gap=(value - learned).abs().mean().item(),
-                noise=expected_deviation(learned, self.rollouts),
+                gap=gap.mean().item(),
+                gap_error=gap.std().item() / len(gap) ** 0.5,
+                noise=expected_deviation(value, self.rollouts),
                 gap_finer=(value[few] - finely).abs().mean().item(),
-                noise_finer=expected_deviation(finely, max(2, self.rollouts // 2)),
+                noise_finer=expected_deviation(value[few], max(2, self.rollouts // 2)),
                 bias=_difference(value, learned),
                 value_spread=value.std().item(),
                 success_spread=learned.std().item(),

@@ -23,7 +23,7 @@ class Grid(NamedTuple):
     Attributes:
         tau: times to go (taus,) in s.
         x: states (states,) in SI units.
-        value: V of the networks alone (states, taus).
+        value: V (states, taus), which is 1 in A and 0 in B.
         exact: exact V (states, taus), or None if it is not known.
         control: the policy (controls, states, taus) in SI units.
     """
@@ -36,7 +36,7 @@ class Grid(NamedTuple):
 
 
 def evaluate_on_grid(solution: Solution, taus: int = 101, states: int = 201) -> Grid:
-    """Compute V of the networks alone and the policy on [0, T] x `problem.states`, the grid of the paper's error."""
+    """Compute V and the policy on [0, T] x `problem.states`, the grid of the paper's error."""
     problem = solution.problem
     tau = torch.linspace(0, problem.horizon, taus, dtype=torch.float64)
     x = torch.linspace(problem.states.low[0], problem.states.high[0], states, dtype=torch.float64)
@@ -47,7 +47,7 @@ def evaluate_on_grid(solution: Solution, taus: int = 101, states: int = 201) -> 
     return Grid(
         tau.numpy(),
         x.numpy(),
-        solution.raw_value(*inputs).cpu().numpy().reshape(shape),
+        solution.value(*inputs).cpu().numpy().reshape(shape),
         None if exact is None else exact.numpy().reshape(shape),
         solution.policy(*inputs).cpu().numpy().T.reshape(-1, *shape),
     )

@@ -32,7 +32,7 @@ def draw_slice(cut: Slice) -> Figure:
     section = cut.section
     gap = f"mean |difference| {cut.mae:.3f}"
     if cut.rollouts > 1:
-        gap += f", of which noise {expected_deviation(cut.monte_carlo, cut.rollouts):.3f}"
+        gap += f", of which noise {expected_deviation(section.value, cut.rollouts):.3f}"
     titles = (f"Learned V, τ = {section.time:g} s", f"Monte Carlo of the policy, with lines of V;\n{gap}")
     figure = Figure(figsize=(10.4, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -46,20 +47,27 @@ class Truth:
     error: float = 0.0
 
 
-def find_truth(problem: ReachAvoidProblem, count: int, seed: int) -> Truth:
+def find_truth(problem: ReachAvoidProblem, count: int, seed: int, points: Mapping[int, int] | None = None) -> Truth:
     """The reference values at `count` random states.
 
     Where they come from a grid, states at which it is in doubt are taken only if too few of the drawn ones are left.
+
+    Args:
+        problem: the physics.
+        count: the number of states.
+        seed: of the states and times to go.
+        points: nodes of the grid along each axis, by the number of states; `GRID_POINTS` by default.
     """
+    points = GRID_POINTS if points is None else points
     rng = torch.Generator().manual_seed(seed)
     x = sample_interior(problem, problem.states, SPARE * count, rng, torch.float64)
     tau = problem.horizon * (EARLIEST + (1 - EARLIEST) * torch.rand(len(x), generator=rng, dtype=x.dtype))
     exact = problem.exact_value(tau[:count], x[:count])
     if exact is not None:
         return Truth(tau[:count], x[:count], exact, "exact")
-    if problem.states.dim not in GRID_POINTS:
+    if problem.states.dim not in points:
         return Truth(tau[:count], x[:count], None, "none")
-    grid = GridSolver(problem, GRID_POINTS[problem.states.dim]).solve()
+    grid = GridSolver(problem, points[problem.states.dim]).solve()
     error = grid.error(tau, x)
     kept = (error > DOUBT).long().argsort(stable=True)[:count]
     return Truth(tau[kept], x[kept], grid.value(tau[kept], x[kept]), "grid", error[kept].mean().item())
