@@ -63,8 +63,10 @@ def dubins(points: int, rollouts: int = 2_000) -> None:
     solution = GridSolver(problem, points).solve()
     seconds, (tau, x) = time.perf_counter() - started, states(DubinsCar(), 50)
     played = monte_carlo(problem, solution.policy, tau, x, rollouts=rollouts, dt=0.01)
-    distance = (solution.value(tau, x) - played.probability).abs()
-    noise = (played.probability * (1 - played.probability) / rollouts).sqrt()
+    value = solution.value(tau, x)
+    distance = (value - played.probability).abs()
+    # The standard error if V is right: that of Monte Carlo's own estimate is 0 where no path, or every path, succeeds.
+    noise = (value * (1 - value) / rollouts).sqrt()
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"DubinsCar, {points} points, {seconds:.0f} s, {memory:.1f} GiB")
     print(f"mean |V - MC| {distance.mean():.4f}, largest {distance.max():.4f}")

@@ -59,8 +59,8 @@ def expected_ahead(solution: Solution, tau: Tensor, x: Tensor, length: float) ->
     """E V (*, N) after one Euler step with the action (*, N, m), by a cubature of degree three, Eq. (cubature).
 
     The mean over y = x + f h +- sqrt(w h) sigma_k, for the w columns of sigma, has the mean and the covariance of the
-    step. It stays within the range of V where a second derivative would not: next to a face V may change within one
-    step, and there the learned curvature may be of any size and sign.
+    step. It is bounded where a second derivative is not: next to a face V may change within one step, and there the
+    learned curvature may be of any size and sign. V is continued into A and B, see `continued_value`.
 
     Args:
         solution: gives V, with its values in A and B, and the problem.
@@ -76,9 +76,38 @@ def expected_ahead(solution: Solution, tau: Tensor, x: Tensor, length: float) ->
         sigma = problem.diffusion(y, u).movedim(-1, 0)
         spread = sigma * (len(sigma) * h).sqrt().unsqueeze(-1)
         ends = y + problem.drift(y, u) * h.unsqueeze(-1) + torch.cat([spread, -spread])
-        return solution.value((tau - h).expand(ends.shape[:-1]), ends).mean(0)
+        return continued_value(solution, (tau - h).expand(ends.shape[:-1]), ends).mean(0)
 
     return value
+
+
+def continued_value(solution: Solution, tau: Tensor, x: Tensor) -> Tensor:
+    """V (*), continued into A and B as an odd function about its value at the face, Eq. (continuation).
+
+    By the reflection principle, the mean of this over the ends of paths without drift that start beside a plane face
+    is the mean of V over the paths that stop at the face. Without the continuation the mean would count paths that
+    cross a face and return within the step as if they had not crossed it, and so favour noise beside B.
+
+    Args:
+        solution: gives V, and the problem.
+        tau: times to go (*), in s.
+        x: states (*, n).
+    """
+    problem = solution.problem
+    failed, reached = problem.failed(x), problem.reached(x)
+    y = x
+    if problem.has_avoid_set:
+        y = torch.where(failed.unsqueeze(-1), _mirrored(problem.avoid_level, x), y)
+    if problem.objective == "reach-avoid":
+        y = torch.where(reached.unsqueeze(-1), _mirrored(lambda z: problem.reached_constraints(z).amax(-1), x), y)
+    value = solution.value(tau, y)
+    return torch.where(reached, 2 - value, torch.where(failed, -value, value))
+
+
+def _mirrored(level: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
+    """The states (*, n), mirrored at the zero of a level, to first order in the level."""
+    slope = torch.func.grad(lambda y: level(y).sum())(x)
+    return x - 2 * level(x).unsqueeze(-1) * slope / slope.square().sum(-1, keepdim=True).clamp(min=1e-12)
 
 
 def value_ahead(

@@ -93,6 +93,38 @@ class Levels(nn.Module):
         return torch.cat([x, self.levels(self.of(x))], -1)
 
 
+class LogLevels(nn.Module):
+    """Appends asinh(l / w) of the last k inputs, which are levels l, for inputs (*, N, d).
+
+    Far from a face this is the logarithm of twice the level over w, with the sign of the level. Beside a face V often
+    changes within a layer that is much thinner than the box, as the width sigma^2 / (2 |f|) of a layer against a drift.
+    A sigmoid of log l - log b is l / (l + b): as functions of logarithms, layers of any width b have the same slope.
+
+    Args:
+        width: w (k,) > 0, in the units of the levels.
+    """
+
+    width: Tensor
+
+    def __init__(self, width: Tensor):
+        super().__init__()
+        self.register_buffer("width", width.to(torch.get_default_dtype()))
+
+    def of(self, z: Tensor) -> Tensor:
+        """The levels (*, k) in inputs (*, d)."""
+        return z[..., -self.width.shape[-1] :]
+
+    def logs(self, levels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """asinh(l / w) of levels (*, N, k), and its first and second derivatives, likewise."""
+        width = self.width.unsqueeze(-2)
+        slope = (levels.square() + width.square()).rsqrt()
+        return torch.asinh(levels / width), slope, -levels * slope**3
+
+    def forward(self, z: Tensor) -> Tensor:
+        logs = torch.asinh(self.of(z) / self.width.unsqueeze(-2))
+        return torch.cat([z.expand(*logs.shape[:-1], -1), logs], -1)
+
+
 class Periodic(nn.Module):
     """Replaces periodic coordinates by sine and cosine of their angle: (*, N, d) -> (*, N, d + k) for k of them.
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from pirl_rl.errors import ArgumentError
-from pirl_rl.layers import Dense, Levels, Periodic, RootTime, Scaling
+from pirl_rl.layers import Dense, Levels, LogLevels, Periodic, RootTime, Scaling
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sets import Box
 
@@ -26,6 +26,9 @@ ROOT_TIME_OFFSET = 1e-4
 
 LEVEL_POINTS = 4_096
 """The number of states at which the levels of the sets are taken to scale them."""
+
+LOG_WIDTH = 0.01
+"""The width of `LogLevels`, as a share of the standard deviation of a level over the box of states."""
 
 
 def _stack(
@@ -38,6 +41,7 @@ def _stack(
     root_time: bool,
     scaling: Box | None,
     levels: bool,
+    log_levels: bool = False,
 ) -> nn.Sequential:
     if not all(isinstance(width, int) and width >= 1 for width in hidden):
         raise ArgumentError(f"hidden: expected widths of layers, integers >= 1, got {list(hidden)}")
@@ -45,9 +49,16 @@ def _stack(
     low, high = (0.0, *box.low, *[-1.0] * controls), (problem.horizon, *box.high, *[1.0] * controls)
     layers: list[nn.Module] = []
     if levels:
-        layer, middle, width = _levels(problem)
+        layer, sampled, outside = _levels(problem)
         layers.append(layer)
+        middle, width = sampled.mean(0), sampled.std(0)
         low, high = (*low, *(middle - width).tolist()), (*high, *(middle + width).tolist())
+        if log_levels and len(width):
+            logs = LogLevels(LOG_WIDTH * width)
+            layers.append(logs)
+            # The zeros of the first layer are spread over the states outside A and B.
+            ends = logs.logs(sampled[outside])[0].aminmax(dim=0)
+            low, high = (*low, *ends[0].tolist()), (*high, *ends[1].tolist())
     if root_time:
         tau_0 = ROOT_TIME_OFFSET * problem.horizon
         layers.append(RootTime(tau_0))
@@ -72,14 +83,15 @@ def _constraints(problem: ReachAvoidProblem, kept: Sequence[int] | None, x: Tens
 
 
 def _levels(problem: ReachAvoidProblem) -> tuple[Levels, Tensor, Tensor]:
-    """The layer of the levels of A and B, with their means (k,) and standard deviations (k,) over the box of states."""
+    """The layer of the k levels of A and B, these levels (N, k) at random states of the box, and which of the states
+    are outside A and B, (N,)."""
     x = problem.states.sample(LEVEL_POINTS, torch.Generator().manual_seed(0), torch.float64)
     sampled = _constraints(problem, None, x)
-    middle, width = sampled.mean(0), sampled.std(0)
+    width = sampled.std(0)
     # A level that is constant or infinite says nothing.
     kept = ((width > 0) & width.isfinite()).nonzero().flatten().tolist()
     levels = partial(_constraints, problem, kept if len(kept) < len(width) else None)
-    return Levels(levels, problem.states.dim), middle[kept], width[kept]
+    return Levels(levels, problem.states.dim), sampled[:, kept], problem.interior(x)
 
 
 def _with_periods(box: Box, states: Box) -> Box:
@@ -197,6 +209,7 @@ class Critic(nn.Module):
             points that are uniform in the box. None takes the usual initialisation, for which all zeros pass near the
             middle of the box.
         levels: whether the levels of the constraints of A and B are inputs too, see `Levels`.
+        log_levels: whether the logarithms of these levels are inputs beside them, see `LogLevels`.
 
     Raises:
         ArgumentError: `activation` or `output` is not the name of a layer of `torch.nn`, or `spread` is not positive.
@@ -213,11 +226,12 @@ class Critic(nn.Module):
         scaling: Box | None = None,
         spread: float | None = None,
         levels: bool = False,
+        log_levels: bool = False,
     ):
         super().__init__()
         self.action_input = action_input
         controls = problem.controls.dim if action_input else 0
-        self.layers = _stack(problem, controls, hidden, 1, activation, output, root_time, scaling, levels)
+        self.layers = _stack(problem, controls, hidden, 1, activation, output, root_time, scaling, levels, log_levels)
         _xavier(self.layers)
         _spread(self.layers, spread, problem, controls)
 

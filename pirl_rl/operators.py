@@ -35,7 +35,7 @@ import torch
 from torch import Tensor, nn
 
 from pirl_rl.errors import ArgumentError
-from pirl_rl.layers import Dense, Levels, Periodic, RootTime, Scaling
+from pirl_rl.layers import Dense, Levels, LogLevels, Periodic, RootTime, Scaling
 from pirl_rl.networks import CriticValue
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sigma import times
@@ -135,10 +135,17 @@ def _propagate(layer: nn.Module, z: Tensor, a: Tensor, s: Tensor) -> tuple[Tenso
     if isinstance(layer, RootTime):
         # d sqrt(tau + tau_0) = d tau / (2 sqrt(tau + tau_0)), and tau has no noise.
         root = layer(z)
-        rate = 1 / (2 * root[..., -1:])
+        rate = (1 / (2 * root[..., -1:])).unsqueeze(-3)
         return root, torch.cat([a, a[..., :1] * rate], -1), nn.functional.pad(s, (0, 1))
     if isinstance(layer, Levels):
         rate, kicks = _along_levels(layer.levels, *(layer.of(entry) for entry in (z, a, s)))
+        return layer(z), torch.cat([a, rate], -1), torch.cat([s, kicks], -1)
+    if isinstance(layer, LogLevels):
+        _, slope, curvature = layer.logs(layer.of(z))
+        slope, curvature = slope.unsqueeze(-3), curvature.unsqueeze(-3)
+        rate = slope * layer.of(a) + curvature * layer.of(s).square().sum(-3) / 2
+        kicks = slope.unsqueeze(-3) * layer.of(s)
+        a, s = a.expand(*rate.shape[:-1], -1), s.expand(*kicks.shape[:-1], -1)
         return layer(z), torch.cat([a, rate], -1), torch.cat([s, kicks], -1)
     if isinstance(layer, Scaling):
         return layer(z), a * layer.scale[..., None, None, :], s * layer.scale[..., None, None, None, :]
@@ -192,7 +199,10 @@ def require_twice_differentiable(layers: nn.Sequential) -> None:
         ArgumentError: an activation is not one of `ACTIVATIONS`.
     """
     for layer in layers:
-        if not isinstance(layer, (Levels, RootTime, Scaling, Periodic, Dense)) and type(layer) not in ACTIVATIONS:
+        if (
+            not isinstance(layer, (Levels, LogLevels, RootTime, Scaling, Periodic, Dense))
+            and type(layer) not in ACTIVATIONS
+        ):
             known = ", ".join(sorted(kind.__name__ for kind in ACTIVATIONS))
             raise ArgumentError(
                 f"critic: the HJB residual takes second derivatives, so every activation must be C^2; "

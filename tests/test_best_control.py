@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pirl_rl import Box, ReachAvoidProblem
 from pirl_rl.actor_rules import BestControl, Hamiltonian
-from pirl_rl.ascent import ascend, expected_ahead, hamiltonian, improved, value_ahead
+from pirl_rl.ascent import ascend, continued_value, expected_ahead, hamiltonian, improved, value_ahead
 from pirl_rl.errors import ArgumentError
 from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.problem import has_controlled_noise
@@ -37,8 +37,10 @@ class Steered(ReachAvoidProblem):
         scale = 0.5 + 0.2 * u[..., 1] if self.controlled else torch.full_like(x[..., 0], 0.5)
         return scale[..., None, None] * torch.eye(2).to(x)
 
+    edge = 1.0
+
     def target_level(self, x: Tensor) -> Tensor:
-        return 1.0 - x[..., 0]
+        return self.edge - x[..., 0]
 
 
 def solution_of(problem: ReachAvoidProblem, seed: int = 0) -> Solution:
@@ -77,6 +79,7 @@ class Quadratic:
 def test_the_cubature_is_exact_for_a_quadratic_value():
     """E V = tau - h + m' M m / 2 + h Tr(sigma' M sigma) / 2 with m = x + f h, where h is at most tau."""
     problem, (tau, x) = Steered(controlled=True), points(Steered(), 20)
+    problem.edge = 100.0
     action = 2 * torch.rand(3, 20, 3) - 1
     u, h = problem.controls.denormalize(action), tau.clamp(max=0.3)
     y = x.expand(3, -1, -1)
@@ -85,6 +88,52 @@ def test_the_cubature_is_exact_for_a_quadratic_value():
     expected = Quadratic(problem).value(tau - h, mean) + h * trace / 2
     found = expected_ahead(Quadratic(problem), tau, x, 0.3)(action)  # type: ignore[arg-type]
     assert torch.allclose(found, expected, atol=1e-5)
+
+
+class Channel(ReachAvoidProblem):
+    """Brownian motion in the plane, of any strength up to 1, from the avoid set x_1 <= -1 to the target x_1 >= 1."""
+
+    horizon = 1.0
+    states, controls = Box([-1.0, -1.0], [1.0, 1.0]), Box([0.0], [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.zeros_like(x)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return u[..., None] * torch.eye(2).to(x)
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return 1 - x[..., 0]
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        return 3 * (x[..., 0] + 1)
+
+
+def test_the_value_is_continued_through_faces_as_an_odd_function():
+    solution, tau = solution_of(Channel()), torch.full((50,), 0.5)
+    y, distance = 2 * torch.rand(50) - 1, torch.rand(50)
+    for face, value in ((1.0, 1.0), (-1.0, 0.0)):
+        inside, outside = (torch.stack([face * (1 + side * distance), y], -1) for side in (1, -1))
+        own, beyond = solution.value(tau, outside), continued_value(solution, tau, inside)
+        assert torch.allclose(continued_value(solution, tau, outside), own)
+        assert torch.allclose((own + beyond) / 2, torch.tensor(value), atol=1e-5)
+
+
+class Straight:
+    """V = (1 + x_1)/2 between the sets, where noise neither helps nor harms: V is a martingale for any of it."""
+
+    problem = Channel()
+
+    def value(self, tau: Tensor, x: Tensor) -> Tensor:
+        return ((1 + x[..., 0]) / 2).clamp(0, 1)
+
+
+def test_noise_beside_a_face_is_not_preferred():
+    """Without the continuation into B, a path that crosses its face could return, and noise would seem to help."""
+    x = torch.tensor([[-0.999, 0.0], [-0.95, 0.3], [0.0, 0.0], [0.95, 0.3], [0.999, 0.0]])
+    objective = expected_ahead(Straight(), torch.ones(5), x, 0.05)  # type: ignore[arg-type]
+    still, noisy = (objective(torch.full((5, 1), action)) for action in (-1.0, 1.0))
+    assert torch.allclose(still, noisy, atol=1e-6)
 
 
 @pytest.mark.parametrize(("problem", "levels", "cubature"), [(Reach1D(), 2, False), (Steered(True), 5, True)])

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from oracles import name
 
 from pirl_rl.errors import ArgumentError
-from pirl_rl.layers import Dense, Scaling
+from pirl_rl.layers import Dense, LogLevels, Periodic, Scaling
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.problems import DubinsCar, HalfSpace, Pendulum, Reach1D, ZermeloBoat
 
@@ -85,6 +87,30 @@ def test_the_levels_of_the_sets_are_inputs(problem):
     inputs = scaling(critic.layers[0](torch.cat([torch.rand(len(x), 1), x], -1)))[:, 1 + problem.states.dim :]
     # They are scaled to the mean 0 and the standard deviation 1 over the box.
     torch.testing.assert_close(inputs, (levels - levels.mean(0)) / levels.std(0), atol=0.1, rtol=0.1)
+
+
+def test_a_sigmoid_of_logarithms_is_a_layer_of_any_width():
+    """l / (l + b) = sigmoid(log l - log b), where asinh(l / w) is log(2 l / w) up to w^2 / (4 l^2)."""
+    logs, level = LogLevels(torch.tensor([1e-4])), torch.logspace(-3, 0, 50).unsqueeze(-1)
+    feature = logs(level)[:, 1:]
+    for width in (1e-3, 1e-2, 1e-1):
+        layer = torch.sigmoid(feature - math.log(2 * width / 1e-4))
+        torch.testing.assert_close(layer, level / (level + width), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("problem", [Reach1D(), ZermeloBoat(), DubinsCar(), Pendulum()], ids=name)
+def test_logarithms_of_levels_are_scaled_to_the_states_outside_the_sets(problem):
+    x = problem.states.sample(20_000, torch.Generator().manual_seed(1))
+    critic = Critic(problem, levels=True, log_levels=True, root_time=False)
+    first = next(index for index, layer in enumerate(critic.layers) if isinstance(layer, (Dense, Periodic)))
+    inputs = critic.layers[:first](torch.cat([torch.rand(len(x), 1), x], -1))[problem.interior(x)]
+    plain = first_dense(Critic(problem, levels=True, root_time=False)).in_features - len(problem.states.periodic)
+    logs = inputs[:, plain:]
+    assert logs.shape[-1] == plain - 1 - problem.states.dim
+    low, high = logs.aminmax(dim=0)
+    # The ends are those of other states, and the nearest of 20,000 is nearer to a face than that of 4,096.
+    torch.testing.assert_close(high, torch.ones_like(high), atol=0.05, rtol=0)
+    assert ((low > -2) & (low < -0.9)).all()
 
 
 class Disabled(ZermeloBoat):

@@ -72,11 +72,19 @@ def test_equals_nested_autograd(problem, activation, path):
 
 @pytest.mark.parametrize("action_input", [False, True])
 @pytest.mark.parametrize(
-    ("root_time", "output", "levels"), [(False, "Sigmoid", False), (True, None, False), (True, "Sigmoid", True)]
+    ("root_time", "output", "levels"),
+    [(False, "Sigmoid", False), (True, None, False), (True, "Sigmoid", True), (True, "Sigmoid", "logarithms")],
 )
 @pytest.mark.parametrize("problem", PROBLEMS, ids=name)
 def test_every_problem_equals_nested_autograd(problem, root_time, output, levels, action_input):
-    critic = random_critic(problem, root_time=root_time, output=output, levels=levels, action_input=action_input)
+    critic = random_critic(
+        problem,
+        root_time=root_time,
+        output=output,
+        levels=bool(levels),
+        log_levels=levels == "logarithms",
+        action_input=action_input,
+    )
     tau, x, action, u = points(problem, 20)
     ours = generator(critic.at(action), problem, tau, x, u)
     assert_same(critic, ours, nested_generator(plain(critic, action), problem, tau, x, u))
@@ -84,7 +92,7 @@ def test_every_problem_equals_nested_autograd(problem, root_time, output, levels
 
 @pytest.mark.parametrize("problem", [FullNoise(1, 1, 2), FullNoise(8, 2, 3)], ids=name)
 def test_stacked_critics_equal_each_alone(problem):
-    critics = [random_critic(problem, seed=seed, levels=True) for seed in range(2)]
+    critics = [random_critic(problem, seed=seed, levels=True, log_levels=True) for seed in range(2)]
     twin = stack(critics)
     tau, x, action, u = points(problem, 20)
     both = generator(twin.at(action), problem, tau, x, u)

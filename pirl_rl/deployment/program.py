@@ -7,7 +7,7 @@ import copy
 import torch
 from torch import Tensor
 
-from pirl_rl.layers import Dense, Levels, Periodic, RootTime, Scaling
+from pirl_rl.layers import Dense, Levels, LogLevels, Periodic, RootTime, Scaling
 from pirl_rl.networks import Actor, Critic, unstack
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sets import Box
@@ -78,7 +78,7 @@ class _Network:
         dense = next(layer for layer in layers if isinstance(layer, Dense))
         scaling = next(layer for layer in layers if isinstance(layer, Scaling))
         first, dtype = layers.index(dense), dense.weight.dtype
-        self.features = [layer for layer in layers[:first] if isinstance(layer, (Levels, RootTime))]
+        self.features = [layer for layer in layers[:first] if isinstance(layer, (Levels, LogLevels, RootTime))]
         self.rest = [copy.deepcopy(layer).requires_grad_(False) for layer in layers[first + 1 :]]
         scale, shift, weight, bias = (
             entry.detach().double() for entry in (scaling.scale, scaling.shift, dense.weight, dense.bias)
@@ -95,7 +95,12 @@ class _Network:
 
     def __call__(self, inputs: list[Tensor]) -> Tensor:
         time, x, *_ = inputs
-        features = [layer.levels(x) if isinstance(layer, Levels) else layer.root(time) for layer in self.features]
+        features: list[Tensor] = []
+        for layer in self.features:
+            if isinstance(layer, LogLevels):
+                features.append(torch.asinh(features[-1] / layer.width))
+            else:
+                features.append(layer.levels(x) if isinstance(layer, Levels) else layer.root(time))
         waves = [torch.sin(torch.addmm(phase, x, frequency)) for phase, frequency in self.waves]
         z = torch.addmm(self.bias, torch.cat([*inputs, *features, *waves], -1) - self.middle, self.weight)
         for layer in self.rest:
