@@ -1,4 +1,4 @@
-"""The default recipe on problems of several kinds that had no part in its choice, against the grid.
+"""The default recipe on problems of other kinds than those of the suite, against the grid.
 
     python benchmarks/own_problems.py [NAME ...] [--seed 50] [--out FOLDER] [--json FILE]
 
