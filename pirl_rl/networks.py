@@ -57,8 +57,10 @@ def _stack(
             logs = LogLevels(LOG_WIDTH * width)
             layers.append(logs)
             # The zeros of the first layer are spread over the states outside A and B.
-            ends = logs.logs(sampled[outside])[0].aminmax(dim=0)
-            low, high = (*low, *ends[0].tolist()), (*high, *ends[1].tolist())
+            least, largest = logs.logs(sampled[outside] if outside.any() else sampled)[0].aminmax(dim=0)
+            # A level may be constant outside of its set, as the sign of another one.
+            largest = torch.where(largest > least, largest, least + 1)
+            low, high = (*low, *least.tolist()), (*high, *largest.tolist())
     if root_time:
         tau_0 = ROOT_TIME_OFFSET * problem.horizon
         layers.append(RootTime(tau_0))

@@ -113,6 +113,27 @@ def test_logarithms_of_levels_are_scaled_to_the_states_outside_the_sets(problem)
     assert ((low > -2) & (low < -0.9)).all()
 
 
+class Signed(Reach1D):
+    """A target whose level is 1 outside and -1 inside."""
+
+    def target_level(self, x):
+        return torch.where(super().target_level(x) <= 0, -1.0, 1.0).to(x)
+
+
+class Everywhere(Reach1D):
+    """A target that holds all of the box, with a level that varies."""
+
+    def target_level(self, x):
+        return x[..., 0] - 10
+
+
+@pytest.mark.parametrize("problem", [Signed(), Everywhere()], ids=name)
+def test_logarithms_of_levels_that_say_little_are_finite(problem):
+    critic = Critic(problem, levels=True, log_levels=True, spread=3.0)
+    x = problem.states.sample(100)
+    assert critic(torch.rand(100, 1), x, torch.zeros(100, 1)).isfinite().all()
+
+
 class Disabled(ZermeloBoat):
     """Avoid constraints of which one is constant and one infinite."""
 
