@@ -17,7 +17,7 @@ STATES = "collector.initial_states"
 
 VARIANTS: dict[str, list[str]] = {
     "default": [],
-    "no levels": ["actor.levels=false", "critic.levels=false"],
+    "no levels": ["actor.levels=false", "critic.levels=false", "critic.log_levels=false"],
     "no control variate": ["collector.control_variate=null"],
     "no faces": [f"{STATES}.share=0"],
     "no spread": ["actor.spread=null", "critic.spread=null"],

@@ -43,6 +43,8 @@ def _stack(
     levels: bool,
     log_levels: bool = False,
 ) -> nn.Sequential:
+    if log_levels and not levels:
+        raise ArgumentError("log_levels: expected levels=true beside log_levels=true, got levels=false")
     if not all(isinstance(width, int) and width >= 1 for width in hidden):
         raise ArgumentError(f"hidden: expected widths of layers, integers >= 1, got {list(hidden)}")
     box = _with_periods(scaling or problem.states, problem.states)
@@ -51,16 +53,13 @@ def _stack(
     if levels:
         layer, sampled, outside = _levels(problem)
         layers.append(layer)
-        middle, width = sampled.mean(0), sampled.std(0)
-        low, high = (*low, *(middle - width).tolist()), (*high, *(middle + width).tolist())
-        if log_levels and len(width):
-            logs = LogLevels(LOG_WIDTH * width)
-            layers.append(logs)
-            # The zeros of the first layer are spread over the states outside A and B.
-            least, largest = logs.logs(sampled[outside] if outside.any() else sampled)[0].aminmax(dim=0)
-            # A level may be constant outside of its set, as the sign of another one.
-            largest = torch.where(largest > least, largest, least + 1)
-            low, high = (*low, *least.tolist()), (*high, *largest.tolist())
+        if sampled.shape[-1]:
+            middle, width = sampled.mean(0), sampled.std(0)
+            low, high = (*low, *(middle - width).tolist()), (*high, *(middle + width).tolist())
+            if log_levels:
+                layers.append(logs := LogLevels(LOG_WIDTH * width))
+                least, largest = _range_of_logs(logs, sampled[outside] if outside.any() else sampled)
+                low, high = (*low, *least.tolist()), (*high, *largest.tolist())
     if root_time:
         tau_0 = ROOT_TIME_OFFSET * problem.horizon
         layers.append(RootTime(tau_0))
@@ -94,6 +93,13 @@ def _levels(problem: ReachAvoidProblem) -> tuple[Levels, Tensor, Tensor]:
     kept = ((width > 0) & width.isfinite()).nonzero().flatten().tolist()
     levels = partial(_constraints, problem, kept if len(kept) < len(width) else None)
     return Levels(levels, problem.states.dim), sampled[:, kept], problem.interior(x)
+
+
+def _range_of_logs(logs: LogLevels, sampled: Tensor) -> tuple[Tensor, Tensor]:
+    """The least and the largest logarithm (k,) of each level among levels (N, k), between which the zeros of the first
+    layer are spread. A level may be constant outside of its set, as the sign of another one; its range has length 1."""
+    least, largest = logs.logs(sampled)[0].aminmax(dim=0)
+    return least, torch.where(largest > least, largest, least + 1)
 
 
 def _with_periods(box: Box, states: Box) -> Box:
@@ -214,7 +220,8 @@ class Critic(nn.Module):
         log_levels: whether the logarithms of these levels are inputs beside them, see `LogLevels`.
 
     Raises:
-        ArgumentError: `activation` or `output` is not the name of a layer of `torch.nn`, or `spread` is not positive.
+        ArgumentError: `activation` or `output` is not the name of a layer of `torch.nn`, `spread` is not positive, or
+            `log_levels` is given without `levels`.
     """
 
     def __init__(

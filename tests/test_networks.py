@@ -98,6 +98,11 @@ def test_a_sigmoid_of_logarithms_is_a_layer_of_any_width():
         torch.testing.assert_close(layer, level / (level + width), atol=1e-3, rtol=0)
 
 
+def test_logarithms_of_levels_need_levels():
+    with pytest.raises(ArgumentError, match="log_levels: expected levels=true"):
+        Critic(Reach1D(), log_levels=True)
+
+
 @pytest.mark.parametrize("problem", [Reach1D(), ZermeloBoat(), DubinsCar(), Pendulum()], ids=name)
 def test_logarithms_of_levels_are_scaled_to_the_states_outside_the_sets(problem):
     x = problem.states.sample(20_000, torch.Generator().manual_seed(1))

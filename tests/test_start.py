@@ -197,6 +197,19 @@ def test_the_command_starts_from_a_run(first, cli, tmp_path):
     assert load_config(run).start == str(tmp_path / "link" / RunDirectory.LAST)
 
 
+def test_the_networks_have_the_settings_of_the_run_from_which_they_are(cli, tmp_path):
+    """A setting that is typed stands."""
+    other = tmp_path / "other"
+    small_trainer(other, *NOISELESS, "critic.log_levels=false", "actor.hidden=[16]", "actor.spread=2.0").train()
+    few = ("trainer.updates=3", f"start={other}", "env.num_envs=64", "collector.frames_per_batch=128")
+    code, text = cli(*QUICK, "actor.spread=4.0", *few)
+    assert code == 0, text
+    [run] = tmp_path.glob("runs/*/*")
+    here, there = load_config(run), load_config(other)
+    assert here.critic == there.critic
+    assert here.actor == {**there.actor, "spread": 4.0}
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [

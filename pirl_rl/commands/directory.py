@@ -12,11 +12,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from pirl_rl.assembly import make_trainer
 from pirl_rl.commands.console import outcome
-from pirl_rl.commands.methods import method_of
 from pirl_rl.commands.report import draw_again
+from pirl_rl.commands.start import take_start
 from pirl_rl.configuration import save_config
-from pirl_rl.continuation import restore, start_from
-from pirl_rl.errors import CheckpointError, ConfigError
+from pirl_rl.continuation import restore
+from pirl_rl.errors import ConfigError
 from pirl_rl.evaluation import Evidence, lines_of, meanings_of
 from pirl_rl.figures import draw_run
 from pirl_rl.lock import locked
@@ -61,31 +61,6 @@ def reopen(config: DictConfig, folder: Path, arguments: Sequence[str], trust: Se
     save_config(config, folder)
     record_session(RunDirectory(folder), arguments, trainer.solution.device)
     return trainer
-
-
-def take_start(trainer: Trainer, config: DictConfig) -> None:
-    """Take the networks of another run, and record the file in the configuration.
-
-    The absolute path of the file is recorded: the given path may be relative, or that of a run directory whose newest
-    checkpoint changes when the run is resumed.
-
-    Raises:
-        ConfigError: if `start` is no path.
-        CheckpointError: if the networks do not fit; the message names the method of the other run where it differs.
-    """
-    start = config.start
-    if not isinstance(start, str):
-        raise ConfigError(f"start: expected the path of a run or a checkpoint, got {start!r}")
-    try:
-        config.start = str(start_from(trainer, start))
-    except CheckpointError as error:
-        method = method_of(start)
-        if method in (None, config.method_name):
-            raise
-        raise CheckpointError(
-            f"{error}; that run had method={method} and this one has method={config.method_name}, whose networks may "
-            f"differ: give method={method}, or start from a run with method={config.method_name}"
-        ) from None
 
 
 def show(trainer: Trainer, summary: Mapping[str, float], config: DictConfig, trust: Sequence[str]) -> None:

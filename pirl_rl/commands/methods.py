@@ -8,9 +8,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from pirl_rl.configuration import CONF, load_config
+from pirl_rl.configuration import CONF
 from pirl_rl.errors import ConfigError
-from pirl_rl.run_directory import RunDirectory
 
 NO_SETTINGS = ("defaults", "method_name")
 """Keys of a method's file that are no settings."""
@@ -40,12 +39,6 @@ def check_method(config: DictConfig, typed: Sequence[str]) -> None:
             f"{key}: the method {method} sets {value}, and the experiment {experiment} would change it to "
             f"{composed.get(key)}; expected another method, or {key}=... on the command line"
         )
-
-
-def method_of(start: str) -> str | None:
-    """The method of the run that a directory or a file in its `checkpoints/` belongs to; None if it is not known."""
-    run = RunDirectory(start) if Path(start).is_dir() else RunDirectory.of_checkpoint(Path(start))
-    return load_config(run.path).get("method_name") if run.config.is_file() else None
 
 
 def owned(method: str) -> list[tuple[str, Any]]:

@@ -40,6 +40,7 @@ from pirl_rl.commands.directory import begin, new_directory, refuse_files, reope
 from pirl_rl.commands.methods import check_method
 from pirl_rl.commands.population import resume_population, train_population
 from pirl_rl.commands.solve import solve
+from pirl_rl.commands.start import adopt_networks
 from pirl_rl.configuration import CONF, PACKAGE, load_config
 from pirl_rl.errors import INTERRUPTED, ConfigError
 from pirl_rl.lock import locked
@@ -134,6 +135,7 @@ def prepare(
     """
     # Modules that the user names are trusted; those that a run directory names are not, since it may be foreign.
     check_method(config, overrides)
+    adopt_networks(config, overrides)
     modules = [*config.trust, *named_modules(overrides), *trust]
     drop_leftovers(config, overrides, modules)
     problem = make_problem(config, modules) if problem is None else problem

@@ -41,7 +41,7 @@ from pirl_rl.building import build, convert
 from pirl_rl.commands.baseline import measure
 from pirl_rl.commands.composition import check_overrides, compose, drop_leftovers, register
 from pirl_rl.commands.console import named_modules, quiet_libraries, reported
-from pirl_rl.commands.methods import method_of
+from pirl_rl.commands.start import adopt_networks, method_of
 from pirl_rl.configuration import CONF
 from pirl_rl.continuation import start_from
 from pirl_rl.errors import INTERRUPTED, ConfigError
@@ -195,6 +195,8 @@ def _first(config: DictConfig, train: Sequence[str], trust: Sequence[str]) -> tu
         raise ConfigError(f"evaluation: expected success and calibration, to judge candidates by, got {final}")
     own = training_overrides(_example(config, Path(start)), final, config.seed)
     candidate = compose("train", [*LEADING, *train, *own])
+    candidate.start = start
+    adopt_networks(candidate, train)
     drop_leftovers(candidate, train, trust)
     trainer = make_trainer(candidate, None, trust)
     return trainer, start_from(trainer, start), final
