@@ -1,11 +1,11 @@
 """The default recipe on problems of other kinds than those of the suite, against the grid.
 
-    python benchmarks/own_problems.py [NAME ...] [--seed 50] [--out FOLDER] [--json FILE]
+    python benchmarks/own_problems.py [NAME ...] [--seed 50] [--settings KEY=VALUE ...] [--out FOLDER] [--json FILE]
 
 Each is written as a user would write it. Gusty and Slalom, with other seeds and states, were among the problems on
-which the logarithms of the levels were chosen; the others had no part in any choice. V and the success of the learned
-policy are compared with the grid, in the way of the suite, at 400 states with 1,000 paths from each. A run takes
-minutes; a finished one is loaded.
+which the logarithms of the levels and the width of the actor were chosen; the others had no part in any choice. V and
+the success of the learned policy are compared with the grid, in the way of the suite, at 400 states with 1,000 paths
+from each. A run takes minutes; a finished one is loaded, so that other settings need another folder.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import torch
+import yaml
 from torch import Tensor
 
 import pirl_rl
@@ -180,12 +181,12 @@ class Slalom(ReachAvoidProblem):
 PROBLEMS = {kind.__name__: kind for kind in (Servo, Steering, Evader, Gusty, TwoTanks, Reservoir, Slalom)}
 
 
-def measured(name: str, seed: int, out: Path) -> Score:
+def measured(name: str, seed: int, out: Path, settings: dict) -> Score:
     """Train a problem, or load its finished run, and compare it with the grid."""
     problem, folder = PROBLEMS[name](), out / f"{name}-{seed}"
     truth = find_truth(problem, STATES, STATES_SEED, POINTS)
     if not (folder / "summary.json").exists():
-        pirl_rl.train(problem, folder=folder, seed=seed, report=False, **{"evaluation.during": []})
+        pirl_rl.train(problem, folder=folder, seed=seed, report=False, **{"evaluation.during": []}, **settings)
     run = pirl_rl.load_run(folder, problem=problem)
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     return measure(run.solution, run.simulator, truth, ROLLOUTS, summary["wall_seconds"], int(summary["updates"]))
@@ -195,14 +196,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(PROBLEMS)}; all by default")
     parser.add_argument("--seed", type=int, default=50)
+    parser.add_argument("--settings", nargs="*", default=[], metavar="KEY=VALUE", help="of all trainings")
     parser.add_argument("--out", type=Path, default=Path("runs/own_problems"))
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     if unknown := {*arguments.names} - PROBLEMS.keys():
         parser.error(f"expected names out of {', '.join(PROBLEMS)}, got {', '.join(sorted(unknown))}")
-    scores = {name: measured(name, arguments.seed, arguments.out) for name in arguments.names or PROBLEMS}
+    settings = {key: yaml.safe_load(value) for key, _, value in (text.partition("=") for text in arguments.settings)}
+    scores = {name: measured(name, arguments.seed, arguments.out, settings) for name in arguments.names or PROBLEMS}
     found = {name: asdict(score) for name, score in scores.items()}
-    save(arguments.json, {}, seed=arguments.seed, problems=found)
+    save(arguments.json, {}, seed=arguments.seed, settings=settings, problems=found)
     print(markdown({name: [score] for name, score in scores.items()}, dict.fromkeys(scores, "grid")))
 
 
