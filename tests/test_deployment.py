@@ -57,7 +57,7 @@ def solution_of(problem: ReachAvoidProblem, critics: int = 1, **settings) -> Sol
     """New networks for a problem, with a fixed seed."""
     torch.manual_seed(0)
     features = {"root_time": True, "levels": True, "activation": "SiLU", "spread": 3.0, "hidden": (16,)}
-    critic = features | {"output": "Sigmoid", "log_levels": True} | settings
+    critic = features | {"output": "Sigmoid", "log_levels": settings.get("levels", True)} | settings
     return Solution(problem, Actor(problem, **features), stack([Critic(problem, **critic) for _ in range(critics)]))
 
 

@@ -32,7 +32,7 @@ def adopt_networks(config: DictConfig, typed: Sequence[str]) -> None:
         return
     keys = {text.partition("=")[0].lstrip("+~") for text in typed}
     kept = {key: OmegaConf.select(config, key) for key in keys if key.partition(".")[0] in NETWORKS}
-    for name in NETWORKS:
+    for name in (name for name in NETWORKS if name in other):
         OmegaConf.update(config, name, OmegaConf.to_container(other[name], resolve=True), merge=False)
     for key, value in kept.items():
         OmegaConf.update(config, key, value, force_add=True)
