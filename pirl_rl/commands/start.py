@@ -14,7 +14,7 @@ from pirl_rl.run_directory import RunDirectory
 from pirl_rl.trainer import Trainer
 
 NETWORKS = ("actor", "critic")
-"""The settings of the networks."""
+"""The nodes of the configuration that build the networks."""
 
 
 def adopt_networks(config: DictConfig, typed: Sequence[str]) -> None:
