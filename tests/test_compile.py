@@ -14,6 +14,8 @@ from torch._dynamo.utils import counters
 
 from pirl_rl import learner
 from pirl_rl.actor_rules import BestControl, ClippedSurrogate, LookAhead
+from pirl_rl.assembly import make_trainer
+from pirl_rl.commands.composition import compose
 from pirl_rl.compilation import compiled
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.simulator import Simulator
@@ -152,3 +154,18 @@ def test_compiled_and_eager_trainings_have_the_same_curves(settings, tmp_path):
         tables.append(np.genfromtxt(RunDirectory(tmp_path / compile).metrics, delimiter=",", skip_header=1))
     assert len(tables[0]) > 5
     np.testing.assert_allclose(*tables, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ((), True),
+        (("env.num_envs=64", "collector.frames_per_batch=640"), None),
+        (("evaluation.simulator.substeps=3",), None),
+        (("compile=false",), False),
+    ],
+)
+def test_evaluators_share_the_compiled_simulator_of_the_environment(settings, expected):
+    """Where it has the same steps and as many paths as they play at once; None leaves the choice to each evaluator."""
+    trainer = make_trainer(compose("train", ["+experiment=reach1d", "device=cpu", "logger=none", *settings]))
+    assert trainer.simulator.compile is expected

@@ -21,8 +21,12 @@ from pirl_rl.simulator import Simulator, Step, exit_value
 
 Array = TypeVar("Array", float, np.ndarray, Tensor)
 
-PATHS = 16_384
-"""Number of paths that are simulated at once. A step then fits into the cache of a core."""
+PATHS, DEVICE_PATHS = 2_048, 16_384
+"""Number of paths that are simulated at once on the CPU, and on other devices.
+
+On the CPU more of them are no faster, and the environment of the default recipe has as many, so that one compiled
+program is enough for both. On a GPU a step of few paths takes as long as one of many.
+"""
 
 ENTRIES = 2**24
 """Number of entries of sigma, over all paths that are simulated at once, which bounds the memory with many states."""
@@ -135,6 +139,11 @@ def monte_carlo(
     return Estimate(*(entry.cpu().numpy() for entry in (mean, low, high)), rollouts=rollouts)
 
 
+def paths_at_once(device: torch.device) -> int:
+    """The number of paths that are simulated at once on a device, unless they have very many states."""
+    return PATHS if device.type == "cpu" else DEVICE_PATHS
+
+
 @torch.no_grad()
 def mean_payoff(
     simulator: Simulator,
@@ -155,7 +164,7 @@ def mean_payoff(
     unknown = (~known).nonzero().squeeze(-1)
     if simulator.compile is None and rollouts * simulator.substeps * int(steps[unknown].sum()) >= COMPILED_FROM:
         simulator = simulator.compiled
-    width = max(1, min(PATHS, ENTRIES // (x.shape[-1] * simulator.channels)))
+    width = max(1, min(paths_at_once(x.device), ENTRIES // (x.shape[-1] * simulator.channels)))
     total = _total_payoffs(simulator, policy, steps, tau / steps, x, unknown, rollouts, width, rng)
     return torch.where(known, value.double(), total / rollouts)
 
