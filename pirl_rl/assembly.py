@@ -33,10 +33,10 @@ AUTO = "auto"
 Keys that take it: env.dt, env.substeps, trainer.updates, loss.hjb_probes and the entries of `PATHS`.
 """
 
-UPDATES_PER_DIMENSION, MOST_UPDATES = 3_500, 20_000
+UPDATES_PER_DIMENSION, MOST_UPDATES = 2_300, 13_000
 """The number of updates that is chosen for each dimension of (tau, x), and the largest that is chosen."""
 
-MOST_COORDINATES = 1_400_000
+MOST_COORDINATES = 900_000
 """The largest number of updates times states that is chosen: with a hundred states each update takes long."""
 
 PATHS = {

@@ -47,7 +47,8 @@ class BestControl(ActorRule):
         levels: the number of levels of each coordinate of the control among the candidates, bounds included; at least
             2. None takes two where the Hamiltonian is affine in u, so that they hold its maximum, and else five.
         budget: the largest number of points times controls; of more points the first are taken, so that an update of
-            the actor does not cost more with more controls.
+            the actor does not cost more with more controls. Where sigma depends on u, it is the number of values of V
+            after one control step, of which each control at each point needs one for each level and cubature point.
 
     Raises:
         ArgumentError: `steps` is below 0, `levels` below 2, or `budget` below 1.
@@ -67,14 +68,15 @@ class BestControl(ActorRule):
             raise ArgumentError(
                 f"actor_rule: expected steps >= 0, levels >= 2 and budget >= 1, got {steps}, {levels} and {budget}"
             )
-        self.simulator, self.steps, self.levels, self.budget = simulator, steps, levels, budget
+        self.simulator, self.steps, self.levels = simulator, steps, levels
         self.controlled_noise, self.compiles_whole = has_controlled_noise(problem), steps == 0
-        self.cubature = self.controlled_noise and noise_channels(problem) * problem.controls.dim <= 64
+        channels, controls = noise_channels(problem), problem.controls.dim
+        self.cubature = steps == 0 and self.controlled_noise and channels * controls <= 64
+        self.points = max(1, budget // (controls * (levels * 2 * channels if self.cubature else 1)))
         self.flow: Flow = simulator.flow
 
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
-        count = max(1, self.budget // solution.problem.controls.dim)
-        tau, x = points["tau"][:count], points["state"][:count]
+        tau, x = points["tau"][: self.points], points["state"][: self.points]
         logits = solution.actor.logits(tau, x)
         with torch.no_grad():
             action = torch.tanh(logits)
@@ -84,7 +86,7 @@ class BestControl(ActorRule):
         entropy = torch.nn.functional.binary_cross_entropy_with_logits(2 * logits, (1 + best) / 2, reduction="none")
         duration = self.simulator.dt if self.steps or self.cubature else 1.0
         loss = solution.problem.horizon / duration * (weight * entropy).sum(-1)
-        mask = points["mask"][:count] if "mask" in points.keys() else torch.ones_like(loss, dtype=torch.bool)
+        mask = points["mask"][: self.points] if "mask" in points.keys() else torch.ones_like(loss, dtype=torch.bool)
         return -masked_mean(loss, mask)
 
     def _objective(self, solution: Solution, tau: Tensor, x: Tensor) -> Objective:
