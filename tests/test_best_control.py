@@ -203,6 +203,13 @@ def test_more_controls_take_fewer_points():
     assert torch.equal(few(solution, batch, batch), all_of_them(solution, batch[:10], batch[:10]))
 
 
+def test_points_at_which_v_has_a_mean_over_many_ends_are_fewer():
+    """With three controls, five levels and two noise channels, each of the points needs 3 * 5 * 4 values of V."""
+    problem = Steered(controlled=True)
+    assert BestControl(problem, Simulator(problem, 0.1), budget=10 * 60 + 59).points == 10
+    assert BestControl(problem, Simulator(problem, 0.1), steps=2, budget=10 * 3).points == 10
+
+
 @pytest.mark.parametrize("controlled", [False, True])
 def test_a_short_look_ahead_is_the_hamiltonian(controlled):
     """(V ahead of u - V ahead of 0)/dt tends to H(u) - H(0), with an error of the order of dt."""
