@@ -155,7 +155,7 @@ def make_trainer(
         stages=[_make_stage(node, f"stages[{i}]", trust, parts) for i, node in enumerate(config.stages)],
         during=make_evaluators(config.evaluation, "during", trust),
         final=make_evaluators(config.evaluation, "final", trust),
-        simulator=_shared(make_evaluation_simulator(config, env.problem), env),
+        simulator=_share(make_evaluation_simulator(config, env.problem), env),
         logger=build(config.logger, "logger", trust),
         folder=folder,
         config=OmegaConf.to_container(config, resolve=True),
@@ -249,13 +249,15 @@ def make_evaluation_simulator(config: DictConfig, problem: ReachAvoidProblem) ->
     return build(config.evaluation.simulator, "evaluation.simulator", problem=problem, compile=may_compile)
 
 
-def _shared(simulator: Simulator, env: ReachAvoidEnv) -> Simulator:
-    """The environment's simulator in place of an equal one, where it is compiled for the number of paths of evaluators.
+def _share(simulator: Simulator, env: ReachAvoidEnv) -> Simulator:
+    """The simulator, which shares that of the environment if both are equal and that one is compiled for as many paths.
 
-    The evaluations during training then take a quarter of their time without the compilation, and compile nothing.
+    The evaluations during training then take less time, and compile nothing.
     """
     same = simulator.compile is None and simulator.compiled == env.simulator
-    return env.simulator if same and env.batch_size[0] == paths_at_once(env.device) else simulator
+    if same and env.batch_size[0] == paths_at_once(env.device):
+        simulator.share(env.simulator)
+    return simulator
 
 
 def make_starts(config: DictConfig, trust: Sequence[str] = ()) -> InitialStates:

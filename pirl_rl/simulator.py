@@ -17,7 +17,7 @@ into their period at the end of each sub-step, before levels are taken there.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from numbers import Real
 from typing import Literal, NamedTuple
@@ -59,6 +59,10 @@ def exit_value(problem: ReachAvoidProblem, step: Step) -> Tensor:
 class Simulator:
     """Integrates a problem over one control step.
 
+    Attributes:
+        shared: a compiled simulator of the same steps that is compiled for the number of paths that functions play at
+            once, see `share`; None if there is none.
+
     Args:
         problem: the physics.
         dt: the length of a control step, in s.
@@ -76,6 +80,7 @@ class Simulator:
     substeps: int = 1
     crossing: Literal["bridge", "endpoint"] = "bridge"
     compile: bool | None = None
+    shared: Simulator | None = field(default=None, init=False, compare=False, repr=False)
 
     def __post_init__(self):
         if not (isinstance(self.dt, Real) and 0 < self.dt <= self.problem.horizon):
@@ -94,6 +99,10 @@ class Simulator:
     def compiled(self) -> Simulator:
         """The same simulator with compiled sub-steps, which are compiled once however often it is asked for."""
         return replace(self, compile=True)
+
+    def share(self, compiled: Simulator) -> None:
+        """Let functions that play many paths take another simulator, which equals `self.compiled`."""
+        object.__setattr__(self, "shared", compiled)
 
     @cached_property
     def channels(self) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import warnings
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -17,6 +18,7 @@ from pirl_rl.actor_rules import BestControl, ClippedSurrogate, LookAhead
 from pirl_rl.assembly import make_trainer
 from pirl_rl.commands.composition import compose
 from pirl_rl.compilation import compiled
+from pirl_rl.evaluation import statements_of
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.simulator import Simulator
 
@@ -157,15 +159,30 @@ def test_compiled_and_eager_trainings_have_the_same_curves(settings, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("settings", "expected"),
+    ("settings", "shared"),
     [
         ((), True),
-        (("env.num_envs=64", "collector.frames_per_batch=640"), None),
-        (("evaluation.simulator.substeps=3",), None),
+        (("env.num_envs=64", "collector.frames_per_batch=640"), False),
+        (("evaluation.simulator.substeps=3",), False),
         (("compile=false",), False),
     ],
 )
-def test_evaluators_share_the_compiled_simulator_of_the_environment(settings, expected):
-    """Where it has the same steps and as many paths as they play at once; None leaves the choice to each evaluator."""
+def test_evaluators_share_the_compiled_simulator_of_the_environment(settings, shared):
+    """Where it has the same steps and as many paths as they play at once."""
     trainer = make_trainer(compose("train", ["+experiment=reach1d", "device=cpu", "logger=none", *settings]))
-    assert trainer.simulator.compile is expected
+    simulator = trainer.simulator
+    assert (simulator.shared is not None) == shared
+    # Evaluators that take single steps, of other numbers of paths, do not compile them.
+    assert simulator.compile is (None if "compile=false" not in settings else False)
+    assert replace(simulator, dt=0.5).shared is None
+
+
+PATHS_OF_STATES = ("calibration.rollouts", "slices.rollouts", "verdict.rollouts")
+
+
+@needs_compiler
+def test_all_evaluators_play_a_shared_simulator():
+    """They play other numbers of paths than the environment; each would otherwise be compiled by itself."""
+    paths = [f"evaluation.{key}=2" for key in ("success.episodes", *PATHS_OF_STATES)]
+    trainer = make_trainer(compose("train", ["+experiment=reach1d", "device=cpu", "logger=none", *paths]))
+    assert {"success_rate", "calibration_mse", "verdict"} <= {*trainer.finish(), *statements_of(trainer.evidence)}

@@ -162,7 +162,9 @@ def mean_payoff(
     known, value = _known(simulator.problem, tau, x)
     steps = refinement * simulator.clock.split(tau)[0].clamp(min=1)
     unknown = (~known).nonzero().squeeze(-1)
-    if simulator.compile is None and rollouts * simulator.substeps * int(steps[unknown].sum()) >= COMPILED_FROM:
+    if simulator.shared is not None:
+        simulator = simulator.shared
+    elif simulator.compile is None and rollouts * simulator.substeps * int(steps[unknown].sum()) >= COMPILED_FROM:
         simulator = simulator.compiled
     width = max(1, min(paths_at_once(x.device), ENTRIES // (x.shape[-1] * simulator.channels)))
     total = _total_payoffs(simulator, policy, steps, tau / steps, x, unknown, rollouts, width, rng)
