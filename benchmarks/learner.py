@@ -33,13 +33,14 @@ from benchmarks.record import save
 from pirl_rl import compilation
 from pirl_rl.actor_rules import Q
 from pirl_rl.learner import with_gradient
-from pirl_rl.losses import Networks, PIRLLoss
+from pirl_rl.losses import PIRLLoss
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems import Reach1D
 from pirl_rl.sampling.boundary import BoundarySampler
 from pirl_rl.sampling.collocation import Collocation
 from pirl_rl.sets import Box
+from pirl_rl.terms import HJBResidual, Networks
 
 POLYAK = 0.005
 
@@ -61,15 +62,15 @@ class SevenStates(ReachAvoidProblem):
         return 2 - x[..., 0]
 
 
-class NestedLoss(PIRLLoss):
-    """`PIRLLoss` with the generator, Eq. (parabolic_operator), by nested autograd."""
+class NestedResidual(HJBResidual):
+    """`HJBResidual` with the generator, Eq. (parabolic_operator), by nested autograd."""
 
-    def _residuals(
+    def residuals(
         self, networks: Networks, points: TensorDictBase, action: Tensor, probes: Tensor | None = None
     ) -> Tensor:
         tau, x, u = points["tau"].squeeze(-1), points["state"], self.problem.controls.denormalize(action)
         f, sigma = self.problem.drift(x, u), self.problem.diffusion(x, u)
-        count = self.num_qvalue_nets
+        count = len(next(networks.critic.parameters()))
         y = torch.cat([tau.unsqueeze(-1), x], -1).expand(count, -1, -1).contiguous().requires_grad_()
         value = networks.critic(y[..., :1], y[..., 1:], action.expand(count, -1, -1))
         (gradient,) = torch.autograd.grad(value.sum(), y, create_graph=True)
@@ -113,9 +114,9 @@ def make_batch(shape: Shape) -> TensorDict:
 class Variant:
     """A variant of the update: `update()` makes a complete update, `hjb()` computes the HJB loss and its gradient."""
 
-    def __init__(self, shape: Shape, kind: type[PIRLLoss], compiled: bool):
+    def __init__(self, shape: Shape, nested: bool, compiled: bool):
         torch.manual_seed(0)
-        self.loss = kind(
+        self.loss = PIRLLoss(
             shape.problem,
             Actor(shape.problem, (32, 32)),
             [Critic(shape.problem, shape.critic, action_input=True, root_time=False) for _ in range(2)],
@@ -138,8 +139,11 @@ class Variant:
         self.critic_adam = torch.optim.Adam(self.critics, 1e-4, fused=True)
         self.actor_adam = torch.optim.Adam(self.actor, 1e-4, fused=True)
         wrap: Callable = compilation.compiled if compiled else lambda function: function
-        if compiled and kind is NestedLoss:
-            self.loss._residuals = torch.compiler.disable(self.loss._residuals)  # type: ignore[method-assign]
+        if nested:
+            # The same settings as those of the loss above.
+            self.loss.hjb = NestedResidual(shape.problem, noise=0.0, noise_clip=1.0, delta=None, probes=0)
+            if compiled:
+                self.loss.hjb.residuals = torch.compiler.disable(self.loss.hjb.residuals)  # type: ignore[method-assign]
         self.critic_loss = wrap(with_gradient(self.loss.critic_loss, self.loss.qvalue_network_params))
         self.actor_loss = wrap(with_gradient(self.loss.actor_loss, self.loss.actor_network_params))
         self.hjb_loss = wrap(with_gradient(self._hjb_loss, self.loss.qvalue_network_params))
@@ -158,7 +162,7 @@ class Variant:
         self.hjb_loss(self.batch["collocation"])
 
     def _hjb_loss(self, points: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        return self.loss._hjb_loss(self.loss.networks, points, TensorDict()), {}
+        return self.loss.hjb(self.loss.networks, points, TensorDict()), {}
 
     @staticmethod
     def _descend(params: list[Tensor], gradient: tuple[Tensor, ...], optimiser: torch.optim.Optimizer) -> None:
@@ -220,10 +224,10 @@ def milliseconds(work: Callable[[], None], repeats: int) -> float:
 def measure(shape: Shape, rounds: int, updates: int, short: bool) -> dict[str, Any]:
     """The median times of all variants in ms, and what they say about ours."""
     variants: dict[str, Variant | MatrixProducts] = {
-        "nested autograd": Variant(shape, NestedLoss, compiled=False),
-        **({} if short else {"nested, others compiled": Variant(shape, NestedLoss, compiled=True)}),
-        "ours, eager": Variant(shape, PIRLLoss, compiled=False),
-        "ours, compiled": Variant(shape, PIRLLoss, compiled=True),
+        "nested autograd": Variant(shape, nested=True, compiled=False),
+        **({} if short else {"nested, others compiled": Variant(shape, nested=True, compiled=True)}),
+        "ours, eager": Variant(shape, nested=False, compiled=False),
+        "ours, compiled": Variant(shape, nested=False, compiled=True),
         "matrix products": MatrixProducts(shape),
     }
     parts = {"update": "update"} if short else {"update": "update", "HJB term": "hjb"}

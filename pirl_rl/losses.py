@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -21,37 +21,14 @@ from pirl_rl.actor_rules import ActorRule
 from pirl_rl.errors import ArgumentError
 from pirl_rl.internals import ScheduledTD3Loss
 from pirl_rl.networks import Actor, Critic
-from pirl_rl.operators import generator, masked_mean, rademacher, require_twice_differentiable
-from pirl_rl.problem import ReachAvoidProblem, noise_channels
+from pirl_rl.operators import require_twice_differentiable
+from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.schedules import WEIGHTS
 from pirl_rl.solution import Solution
+from pirl_rl.terms import BoundaryValues, HJBResidual, Networks, TemporalDifferences
 
 TERMS = ("td_loss", "hjb_loss", "boundary_loss")
 """The names of the terms of the critic loss, in the order of their weights."""
-
-TD_CRITERIA = ("squares", "cross_entropy")
-
-LARGEST_LOGIT = 10.0
-"""Logits of V beyond this, at which V is 5e-5 away from 0 or 1, are held back."""
-
-LOGIT_WEIGHT = 0.1
-"""The weight of the square of what a logit exceeds that by."""
-
-_cross_entropy = nn.functional.binary_cross_entropy_with_logits
-
-
-class Networks(NamedTuple):
-    """What the losses evaluate: the networks, where one module has the parameters of all critics, and the weights.
-
-    The frozen critic has the parameters of the critic, without gradients; the weights are (w_TD, w_HJB, w_BC).
-    """
-
-    critic: Critic
-    frozen_critic: Critic
-    target_critic: Critic
-    actor: Actor
-    target_actor: Actor
-    weights: Sequence[Tensor]
 
 
 class PIRLLoss(ScheduledTD3Loss):
@@ -124,17 +101,10 @@ class PIRLLoss(ScheduledTD3Loss):
     ):
         for critic in critics:
             actor_rule.check(critic)
-        if td_criterion not in TD_CRITERIA:
-            raise ArgumentError(f"loss.td_criterion: expected one of {', '.join(TD_CRITERIA)}, got {td_criterion!r}")
+        td = TemporalDifferences(td_criterion, target_critics, policy_noise, noise_clip)
         if td_criterion == "cross_entropy" and not all(isinstance(critic.layers[-1], nn.Sigmoid) for critic in critics):
             raise ArgumentError("loss.td_criterion: 'cross_entropy' needs critics with output 'Sigmoid'")
-        if target_critics not in ("min", "mean"):
-            raise ArgumentError(f"loss.target_critics: expected 'min' or 'mean', got {target_critics!r}")
-        if hjb_probes < 0 or hjb_probes == 1:
-            raise ArgumentError(
-                "loss.hjb_probes: expected 0 for the exact trace, or at least 2, since the square of a residual needs "
-                f"two independent estimates, got {hjb_probes}"
-            )
+        hjb = HJBResidual(problem, hjb_noise, hjb_noise_clip, hjb_delta, hjb_probes)
         for critic in critics:
             require_twice_differentiable(critic.layers)
         one = torch.ones(problem.controls.dim)
@@ -157,10 +127,7 @@ class PIRLLoss(ScheduledTD3Loss):
         self.target_qvalue_network_params.data.copy_(own)
         self.make_value_estimator(gamma=1.0)
         self.problem = problem
-        self.td_criterion, self.target_critics = td_criterion, target_critics
-        self.hjb_noise, self.hjb_noise_clip = hjb_noise, hjb_noise_clip
-        self.hjb_delta, self.boundary_delta = hjb_delta, boundary_delta
-        self.hjb_probes, self.channels = hjb_probes, noise_channels(problem)
+        self.td, self.hjb, self.boundary = td, hjb, BoundaryValues(boundary_delta)
         self.actor_rule = actor_rule
         self.logit_penalty = logit_penalty
         for name, value in zip(WEIGHTS, (td_weight, hjb_weight, boundary_weight), strict=True):
@@ -199,19 +166,10 @@ class PIRLLoss(ScheduledTD3Loss):
         The losses draw them for batches without this part. Compiled code would draw other numbers than eager code, so
         that the learner adds them before.
         """
-        noise, action = {}, batch["replay", "action"]
         # TD3Loss draws its smoothing noise before anything else; with the same order, both draw the same noise.
-        if self.policy_noise:
-            noise["smoothing"] = _clipped_noise(action, self.policy_noise, self.noise_clip)
+        noise = self.td.draw(batch["replay", "action"])
         if "collocation" in batch.keys():
-            x = batch["collocation", "state"]
-            if self.hjb_noise:
-                like = x[:, :1].expand(-1, action.shape[-1])
-                noise["control"] = _clipped_noise(like, self.hjb_noise, self.hjb_noise_clip)
-            if self.hjb_probes:
-                noise["probes"] = rademacher(self.hjb_probes, x, self.channels)
-                if self.hjb_delta is not None:
-                    noise["probes_of_size"] = rademacher(self.hjb_probes, x, self.channels)
+            noise |= self.hjb.draw(batch["collocation", "state"])
         return batch.copy().set("noise", TensorDict(noise))
 
     def critic_loss(self, batch: TensorDictBase, networks: Networks | None = None) -> tuple[Tensor, dict[str, Tensor]]:
@@ -225,11 +183,11 @@ class PIRLLoss(ScheduledTD3Loss):
         batch = batch if "noise" in batch.keys() else self.with_noise(batch)
         noise, replay, parts = batch.get("noise"), batch.get("replay"), {}
         if "next" in replay.keys():
-            parts["td_loss"] = self._td_loss(networks, replay, noise)
+            parts["td_loss"] = self.td(networks, replay, noise)
         if "collocation" in batch.keys():
-            parts["hjb_loss"] = self._hjb_loss(networks, batch.get("collocation"), noise)
+            parts["hjb_loss"] = self.hjb(networks, batch.get("collocation"), noise)
         if "boundary" in batch.keys():
-            parts["boundary_loss"] = self._boundary_loss(networks, batch.get("boundary"))
+            parts["boundary_loss"] = self.boundary(networks, batch.get("boundary"))
         weights = dict(zip(TERMS, networks.weights, strict=True))
         loss = sum((weights[name] * part for name, part in parts.items()), torch.zeros_like(networks.weights[0]))
         return loss, {name: part.detach() for name, part in parts.items()}
@@ -270,97 +228,9 @@ class PIRLLoss(ScheduledTD3Loss):
         networks = self.networks
         return Solution(self.problem, networks.actor, networks.critic)
 
-    def _target_action(self, networks: Networks, points: TensorDictBase) -> Tensor:
-        """The output (N, m) in [-1, 1] of the target actor, without a gradient."""
-        with torch.no_grad():
-            return networks.target_actor(points["tau"], points["state"])
-
-    def _residuals(
-        self, networks: Networks, points: TensorDictBase, action: Tensor, probes: Tensor | None = None
-    ) -> Tensor:
-        """L^u Q_i(., action) (critics, N), with the critics' action (N, m) frozen and u = action in physical units.
-
-        With probes (k, N, w) there are k estimates of each, (critics, k, N).
-        """
-        tau, x, u = points["tau"].squeeze(-1), points["state"], self.problem.controls.denormalize(action)
-        return generator(networks.critic.at(action), self.problem, tau, x, u, probes)
-
-    def _td_loss(self, networks: Networks, replay: TensorDictBase, noise: TensorDictBase) -> Tensor:
-        """L_TD summed over critics: (Q_i - r - (1 - d) min_j Q_j^-(y', pi^-(y') + noise))^2."""
-        following: TensorDictBase = replay.get("next")
-        action = self._target_action(networks, following)
-        if self.policy_noise:
-            action = (action + noise["smoothing"]).clamp(-1, 1)
-        with torch.no_grad():
-            values = networks.target_critic(following["tau"], following["state"], action)
-            value = values.amin(0) if self.target_critics == "min" else values.mean(0)
-            target = following["reward"] + (~following["terminated"]) * value
-        inputs = replay["tau"], replay["state"], replay["action"]
-        if self.td_criterion == "squares":
-            error = (networks.critic(*inputs) - target).square()
-        else:
-            # Targets may lie outside [0, 1] by a control variate. The loss is linear in them, so that their mean
-            # counts, and from the logits it has a gradient where the output is rounded to 0 or 1.
-            # Without a bound a network that tells single targets apart would follow them to infinity.
-            logits = networks.critic.logits(*inputs)
-            error = _cross_entropy(logits, target.expand_as(logits), reduction="none")
-            error = error + LOGIT_WEIGHT * (logits.abs() - LARGEST_LOGIT).clamp(min=0).square()
-        return error.squeeze(-1).sum(0).mean()
-
-    def _hjb_loss(self, networks: Networks, points: TensorDictBase, noise: TensorDictBase) -> Tensor:
-        """L_PDE summed over critics: the mean of (L^u Q_i)^2 over unmasked points, u = pi^-(y) + noise."""
-        action = self._target_action(networks, points)
-        if self.hjb_noise:
-            action = (action + noise["control"]).clamp(-1, 1)
-        if self.hjb_probes:
-            squares = self._estimated_squares(networks, points, action, noise)
-        else:
-            squares = _huber(self._residuals(networks, points, action), self.hjb_delta)
-        return masked_mean(squares.sum(0), points["mask"])
-
-    def _estimated_squares(
-        self, networks: Networks, points: TensorDictBase, action: Tensor, noise: TensorDictBase
-    ) -> Tensor:
-        """Unbiased estimates (critics, N) of r^2 for the residuals r of `_residuals`, from k independent probes.
-
-        The square of the mean of the k estimates of r has the mean r^2 + Var/k, from which the sample variance over k
-        is subtracted. For two probes what is left is the product r_1 r_2.
-
-        Huber's loss is a concave function H of r^2. With a delta the result is the tangent of H at the mean square
-        r_0^2 of k more estimates, which take no gradient: H(r_0^2) + H'(r_0^2) (r_1 r_2 - r_0^2). On average its
-        gradient is that of r^2 times the weight E H'(r_0^2), which is at most 1 and falls with r. If r_0 came from the
-        same probes, the loss would fall as the variance of the estimates grows.
-        """
-        estimates = self._residuals(networks, points, action, noise["probes"])
-        square = estimates.mean(-2).square() - estimates.var(-2) / self.hjb_probes
-        if self.hjb_delta is None:
-            return square
-        with torch.no_grad():
-            of_size = self._residuals(networks, points, action, noise["probes_of_size"])
-            size = of_size.square().mean(-2).sqrt()
-        slope = (self.hjb_delta / size).clamp(max=1)
-        return _huber(size, self.hjb_delta) + slope * (square - size.square())
-
-    def _boundary_loss(self, networks: Networks, points: TensorDictBase) -> Tensor:
-        """L_BC summed over critics: the mean of w (Q_i(y, pi^-(y)) - l_eps)^2 with the weights w of the points."""
-        action = self._target_action(networks, points)
-        value = networks.critic(points["tau"], points["state"], action).squeeze(-1)
-        return (points["weight"] * _huber(value - points["value"], self.boundary_delta).sum(0)).mean()
-
 
 def _module(network: TensorDictModule, params: TensorDictBase) -> Any:
     """A module with the structure of a network and with given parameters, stacked ones for critics."""
     twin = copy.deepcopy(network)
     params.to_module(twin, preserve_module_state=False)
     return twin.module
-
-
-def _clipped_noise(like: Tensor, deviation: float, bound: float) -> Tensor:
-    return (torch.randn_like(like) * deviation).clamp(-bound, bound)
-
-
-def _huber(residual: Tensor, delta: float | None) -> Tensor:
-    """r^2, and where |r| exceeds a given delta, 2 delta |r| - delta^2."""
-    if delta is None:
-        return residual.square()
-    return 2 * nn.functional.huber_loss(residual, torch.zeros_like(residual), reduction="none", delta=delta)

@@ -42,7 +42,8 @@ def perceptron(
         controls: the number of actions among the inputs, normalised to [-1, 1].
         hidden: widths of the hidden layers.
         outputs: the number of outputs.
-        activation, output: names of layers of `torch.nn`, after hidden layers and at the end; None for no layer at the end.
+        activation: the name of the layer of `torch.nn` that follows each hidden layer.
+        output: the name of the last layer, which follows the outputs; None for none.
         root_time, scaling, levels, log_levels: see `pirl_rl.networks.Critic`.
 
     Raises:

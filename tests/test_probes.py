@@ -17,7 +17,7 @@ from test_losses import assert_close, gradients, make_loss
 from test_operators import RELATIVE, distance, plain, random_critic
 from torch import Tensor
 
-from pirl_rl import losses
+from pirl_rl import terms
 from pirl_rl.actor_rules import Hamiltonian
 from pirl_rl.assembly import MOST_COLUMNS, PROBES, choose_probes, make_problem, make_trainer
 from pirl_rl.checkpoint import load
@@ -29,6 +29,7 @@ from pirl_rl.operators import generator, rademacher
 from pirl_rl.problem import noise_channels
 from pirl_rl.problems import HalfSpace, Reach1D
 from pirl_rl.run_directory import RunDirectory
+from pirl_rl.terms import target_action
 
 HJB_ALONE = (0.0, 1.0, 0.0)
 
@@ -42,7 +43,7 @@ def all_signs(channels: int, count: int) -> Tensor:
 def deal(monkeypatch, *dealt: Tensor) -> None:
     """Let the loss draw these probes (k, N, w), one after the other."""
     left = iter(dealt)
-    monkeypatch.setattr(losses, "rademacher", lambda *_: next(left))
+    monkeypatch.setattr(terms, "rademacher", lambda *_: next(left))
 
 
 # The generator
@@ -124,12 +125,12 @@ def test_beyond_delta_the_mean_gradient_is_that_of_the_weighted_square(monkeypat
     problem, critics = FullNoise(3, 1, 2), 1
     batch, exact = make_batch(problem), make_loss(problem, critics, HJB_ALONE)
     inside, signs = batch["collocation"], all_signs(2, 24)
-    inputs = exact.networks, inside, exact._target_action(exact.networks, inside)
+    inputs = exact.networks, inside, target_action(exact.networks, inside)
     pairs = [torch.stack(pair) for pair in itertools.product(signs, repeat=2)]
-    sizes = torch.stack([exact._residuals(*inputs, pair)[0].detach().square().mean(0).sqrt() for pair in pairs])
+    sizes = torch.stack([exact.hjb.residuals(*inputs, pair)[0].detach().square().mean(0).sqrt() for pair in pairs])
     delta = sizes.median().item()
     weight = (delta / sizes).clamp(max=1).mean(0)
-    by_hand = (weight * exact._residuals(*inputs)[0].square())[inside["mask"]].mean()
+    by_hand = (weight * exact.hjb.residuals(*inputs)[0].square())[inside["mask"]].mean()
 
     ours = make_loss(problem, critics, HJB_ALONE, hjb_probes=2, hjb_delta=delta)
     deal(monkeypatch, *itertools.chain(*itertools.product(pairs, repeat=2)))
@@ -186,7 +187,7 @@ def test_compiled_probes_equal_eager_ones(monkeypatch):
     problem, rng = FullNoise(4, 1, 3), torch.Generator().manual_seed(0)
     loss, batch = make_loss(problem, policy_noise=0.0, hjb_probes=2, hjb_delta=0.5), make_batch(problem)
     probes = torch.randn(2, 24, 3, generator=rng)
-    monkeypatch.setattr(losses, "rademacher", lambda *_: probes)
+    monkeypatch.setattr(terms, "rademacher", lambda *_: probes)
     eager, ours = loss.critic_loss(batch)[0], torch.compile(loss.critic_loss, fullgraph=True)(batch)[0]
     torch.testing.assert_close(ours, eager, rtol=1e-6, atol=0)
     for mine, other in zip(*(gradients(value, loss.qvalue_network_params) for value in (ours, eager)), strict=True):
@@ -234,5 +235,5 @@ def test_the_choice_is_printed_where_the_residual_has_a_weight(weight, printed, 
     small = ("+debug=default", "device=cpu", "logger=none", "compile=false")
     physics = (f"env.problem.dim={MOST_COLUMNS + 1}", f"pirl.final=[1,{weight},0]")
     trainer = make_trainer(compose("train", ["+experiment=halfspace", *small, *physics]))
-    assert trainer.learner.loss.hjb_probes == PROBES
+    assert trainer.learner.loss.hjb.probes == PROBES
     assert ("trace: The HJB residual takes" in capsys.readouterr().out) == printed
