@@ -47,8 +47,8 @@ class TemporalDifferences:
     """L_TD: the mean of (Q_i - r - (1 - d) min_j Q_j^-(y', pi^-(y') + noise))^2 over transitions, summed over critics.
 
     Args:
-        criterion, target_critics, noise, noise_clip: arguments of `pirl_rl.losses.PIRLLoss`, where the first, the third
-            and the fourth are `td_criterion`, `policy_noise` and `noise_clip`.
+        criterion, target_critics, noise, noise_clip: the arguments `td_criterion`, `target_critics`, `policy_noise` and
+            `noise_clip` of `pirl_rl.losses.PIRLLoss`.
 
     Raises:
         ArgumentError: `criterion` or `target_critics` is unknown.
