@@ -203,11 +203,12 @@ def test_more_controls_take_fewer_points():
     assert torch.equal(few(solution, batch, batch), all_of_them(solution, batch[:10], batch[:10]))
 
 
-def test_points_at_which_v_has_a_mean_over_many_ends_are_fewer():
-    """With three controls, five levels and two noise channels, each of the points needs 3 * 5 * 4 values of V."""
+def test_where_candidates_are_simulated_the_points_are_fewer():
+    """With three controls and five levels, each point needs 15 cubatures of four points, or 15 paths of two steps."""
     problem = Steered(controlled=True)
-    assert BestControl(problem, Simulator(problem, 0.1), budget=10 * 60 + 59).points == 10
-    assert BestControl(problem, Simulator(problem, 0.1), steps=2, budget=10 * 3).points == 10
+    simulator = Simulator(problem, 0.1)
+    assert BestControl(problem, simulator, budget=10 * 60 + 59).points == 10
+    assert BestControl(problem, simulator, steps=2, budget=10 * 30 + 29).points == 10
 
 
 @pytest.mark.parametrize("controlled", [False, True])

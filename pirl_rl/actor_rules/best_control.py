@@ -47,8 +47,8 @@ class BestControl(ActorRule):
         levels: the number of levels of each coordinate of the control among the candidates, bounds included; at least
             2. None takes two where the Hamiltonian is affine in u, so that they hold its maximum, and else five.
         budget: the largest number of points times controls; of more points the first are taken, so that an update of
-            the actor does not cost more with more controls. Where sigma depends on u, it is the number of values of V
-            after one control step, of which each control at each point needs one for each level and cubature point.
+            the actor does not cost more with more controls. Where each level of each control needs a simulation, it is
+            the number of simulated steps: `steps` of a look ahead, or the 2w points of the cubature.
 
     Raises:
         ArgumentError: `steps` is below 0, `levels` below 2, or `budget` below 1.
@@ -72,7 +72,8 @@ class BestControl(ActorRule):
         self.controlled_noise, self.compiles_whole = has_controlled_noise(problem), steps == 0
         channels, controls = noise_channels(problem), problem.controls.dim
         self.cubature = steps == 0 and self.controlled_noise and channels * controls <= 64
-        self.points = max(1, budget // (controls * (levels * 2 * channels if self.cubature else 1)))
+        simulated = steps or (2 * channels if self.cubature else 0)
+        self.points = max(1, budget // (controls * max(1, levels * simulated)))
         self.flow: Flow = simulator.flow
 
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
