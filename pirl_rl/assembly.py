@@ -33,7 +33,7 @@ AUTO = "auto"
 Keys that take it: env.dt, env.substeps, trainer.updates, loss.hjb_probes and the entries of `PATHS`.
 """
 
-UPDATES_PER_DIMENSION, MOST_UPDATES = 2_300, 13_000
+UPDATES_PER_DIMENSION, MOST_UPDATES = 2_300, 16_000
 """The number of updates that is chosen for each dimension of (tau, x), and the largest that is chosen."""
 
 MOST_COORDINATES = 900_000

@@ -272,7 +272,7 @@ def test_a_start_from_another_method_is_told_in_one_sentence(tmp_path, cli):
     assert code == 1
     (line,) = [line for line in text.splitlines() if line.startswith("error: ")]
     assert "its critics have weights of the shapes (2, 32, " in line
-    assert ", expected (1, 64, " in line
+    assert ", expected (1, 128, " in line
     assert "that run had method=td3 and this one has method=pirl" in line
     assert "Traceback" not in text
 
