@@ -140,8 +140,8 @@ class Variant:
         self.actor_adam = torch.optim.Adam(self.actor, 1e-4, fused=True)
         wrap: Callable = compilation.compiled if compiled else lambda function: function
         if nested:
-            # The same settings as those of the loss above.
-            self.loss.hjb = NestedResidual(shape.problem, noise=0.0, noise_clip=1.0, delta=None, probes=0)
+            hjb = self.loss.hjb
+            self.loss.hjb = NestedResidual(hjb.problem, hjb.noise, hjb.noise_clip, hjb.delta, hjb.probes)
             if compiled:
                 self.loss.hjb.residuals = torch.compiler.disable(self.loss.hjb.residuals)  # type: ignore[method-assign]
         self.critic_loss = wrap(with_gradient(self.loss.critic_loss, self.loss.qvalue_network_params))

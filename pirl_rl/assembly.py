@@ -250,9 +250,10 @@ def make_evaluation_simulator(config: DictConfig, problem: ReachAvoidProblem) ->
 
 
 def _share(simulator: Simulator, env: ReachAvoidEnv) -> Simulator:
-    """The simulator, which shares that of the environment if both are equal and that one is compiled for as many paths.
+    """Let a simulator of evaluators share the compiled one of the environment; returns the simulator.
 
-    The evaluations during training then take less time, and compile nothing.
+    It does so if both have the same steps, and if the environment has as many paths as evaluators play at once, since
+    a compiled simulator is made for one number of paths.
     """
     same = simulator.compile is None and simulator.compiled == env.simulator
     if same and env.batch_size[0] == paths_at_once(env.device):

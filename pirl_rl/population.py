@@ -22,8 +22,9 @@ from pirl_rl import checkpoint
 from pirl_rl.compilation import Compiled
 from pirl_rl.errors import ArgumentError, DivergenceError, Interrupted
 from pirl_rl.learner import Gradient, Terms
-from pirl_rl.losses import TERMS, Networks, PIRLLoss
+from pirl_rl.losses import TERMS, PIRLLoss
 from pirl_rl.progress import Progress, announce, interruptible
+from pirl_rl.terms import Networks
 from pirl_rl.trainer import Trainer
 
 PARTS: dict[str, Any] = dict(zip(TERMS, (("replay", "next"), "collocation", "boundary"), strict=True))

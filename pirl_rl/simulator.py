@@ -60,8 +60,8 @@ class Simulator:
     """Integrates a problem over one control step.
 
     Attributes:
-        shared: a compiled simulator of the same steps that is compiled for the number of paths that functions play at
-            once, see `share`; None if there is none.
+        shared: the compiled simulator that functions which play many paths take in place of this one, see `share`;
+            None if there is none.
 
     Args:
         problem: the physics.
@@ -101,7 +101,10 @@ class Simulator:
         return replace(self, compile=True)
 
     def share(self, compiled: Simulator) -> None:
-        """Let functions that play many paths take another simulator, which equals `self.compiled`."""
+        """Let functions that play many paths take another simulator, which equals `self.compiled`.
+
+        Functions that take single steps go on with this one, since each number of paths would be compiled by itself.
+        """
         object.__setattr__(self, "shared", compiled)
 
     @cached_property

@@ -177,12 +177,10 @@ def test_evaluators_share_the_compiled_simulator_of_the_environment(settings, sh
     assert replace(simulator, dt=0.5).shared is None
 
 
-PATHS_OF_STATES = ("calibration.rollouts", "slices.rollouts", "verdict.rollouts")
-
-
 @needs_compiler
 def test_all_evaluators_play_a_shared_simulator():
     """They play other numbers of paths than the environment; each would otherwise be compiled by itself."""
-    paths = [f"evaluation.{key}=2" for key in ("success.episodes", *PATHS_OF_STATES)]
+    numbers = ("success.episodes", "calibration.rollouts", "slices.rollouts", "verdict.rollouts")
+    paths = [f"evaluation.{number}=2" for number in numbers]
     trainer = make_trainer(compose("train", ["+experiment=reach1d", "device=cpu", "logger=none", *paths]))
     assert {"success_rate", "calibration_mse", "verdict"} <= {*trainer.finish(), *statements_of(trainer.evidence)}

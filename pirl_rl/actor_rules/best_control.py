@@ -47,8 +47,9 @@ class BestControl(ActorRule):
         levels: the number of levels of each coordinate of the control among the candidates, bounds included; at least
             2. None takes two where the Hamiltonian is affine in u, so that they hold its maximum, and else five.
         budget: the largest number of points times controls; of more points the first are taken, so that an update of
-            the actor does not cost more with more controls. Where each level of each control needs a simulation, it is
-            the number of simulated steps: `steps` of a look ahead, or the 2w points of the cubature.
+            the actor does not cost more with more controls. Where candidates are simulated, it is the largest number of
+            simulated states. Each level of each control at each point then needs `steps` of them for a look ahead, and
+            2w for the cubature with w noise channels.
 
     Raises:
         ArgumentError: `steps` is below 0, `levels` below 2, or `budget` below 1.
