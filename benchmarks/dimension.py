@@ -39,7 +39,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 
 from benchmarks.record import save
 from pirl_rl.actor_rules import Hamiltonian
-from pirl_rl.assembly import PROBES
+from pirl_rl.automatic import PROBES
 from pirl_rl.compilation import compiled
 from pirl_rl.figures import save_figures
 from pirl_rl.layers import Dense

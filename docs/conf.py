@@ -256,6 +256,7 @@ reference_rooms = {
             "pirl_rl.configuration",
             "pirl_rl.building",
             "pirl_rl.assembly",
+            "pirl_rl.automatic",
             "pirl_rl.continuation",
             "pirl_rl.errors",
         ],

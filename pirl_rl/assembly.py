@@ -12,52 +12,20 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 
+from pirl_rl.automatic import choose_paths, choose_probes, choose_time_steps, choose_updates
 from pirl_rl.building import build, convert
 from pirl_rl.curriculum import Stage
 from pirl_rl.envs import ReachAvoidEnv
-from pirl_rl.errors import ArgumentError, ConfigError
+from pirl_rl.errors import ConfigError
 from pirl_rl.evaluation import Evaluator
 from pirl_rl.evaluation.monte_carlo import paths_at_once
 from pirl_rl.grid import GridSolver
 from pirl_rl.networks import Actor, Critic
-from pirl_rl.problem import ReachAvoidProblem, check_problem, noise_channels
+from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.initial_states import InitialStates
 from pirl_rl.schedules import WEIGHTS
 from pirl_rl.simulator import Simulator
-from pirl_rl.time_steps import check_time_steps, propose_time_steps
 from pirl_rl.trainer import Trainer
-
-AUTO = "auto"
-"""The value that leaves a choice to the package.
-
-Keys that take it: env.dt, env.substeps, trainer.updates, loss.hjb_probes and the entries of `PATHS`.
-"""
-
-UPDATES_PER_DIMENSION, MOST_UPDATES = 2_300, 16_000
-"""The number of updates that is chosen for each dimension of (tau, x), and the largest that is chosen."""
-
-MOST_COORDINATES = 900_000
-"""The largest number of updates times states that is chosen: with a hundred states each update takes long."""
-
-PATHS = {
-    ("success", "episodes"): (10_000, 1_000),
-    ("calibration", "rollouts"): (256, 16),
-    ("slices", "rollouts"): (16, 1),
-    ("verdict", "rollouts"): (64, 8),
-}
-"""Numbers of paths of evaluators, by evaluator and argument: the largest and the smallest that are chosen."""
-
-PROGRESS_SHARE = 5
-"""The evaluator `progress` plays one in this number of the episodes of `success`."""
-
-CHEAP_PATH = 10_000
-"""The number of coordinates of all integration steps of a path up to which evaluators have the largest numbers."""
-
-MOST_COLUMNS = 16
-"""The largest number of noise channels with which the trace of the HJB residual is computed exactly."""
-
-PROBES = 4
-"""The number of random vectors that estimate the trace with more channels."""
 
 
 def pick_device(name: str) -> torch.device:
@@ -128,7 +96,7 @@ def make_trainer(
     problem = make_problem(config, trust) if problem is None else problem
     choose_time_steps(config, problem)
     choose_updates(config, problem)
-    choose_paths(config, problem)
+    choose_paths(config, problem, make_evaluation_simulator(config, problem))
     reason = choose_probes(config, problem)
     supplied = {"problem": problem, "seed": physics, "device": device, "compile_simulator": config.compile}
     env: ReachAvoidEnv = build(_without(config, "env", "problem"), "env", trust, **supplied)
@@ -164,64 +132,6 @@ def make_trainer(
     if reason and trainer.curriculum.largest_weights()[WEIGHTS.index("hjb_weight")]:
         print(f"trace: {reason}", flush=True)
     return trainer
-
-
-def choose_time_steps(config: DictConfig, problem: ReachAvoidProblem) -> None:
-    """Replace `auto` in env.dt and env.substeps by numbers, and print the choice with its reason.
-
-    Raises:
-        ConfigError: one of the two is neither `auto` nor a number, or out of range.
-        ProblemError: the problem contradicts itself.
-    """
-    kinds = {"dt": float, "substeps": int}
-    values = {name: config.env[name] for name in kinds if name in config.env}
-    given = {name: convert(value, kinds[name], f"env.{name}") for name, value in values.items() if value != AUTO}
-    check_problem(problem)
-    try:
-        check_time_steps(problem, given.get("dt"), given.get("substeps"))
-    except ArgumentError as error:
-        raise ConfigError(f"env.{error}") from None
-    if AUTO not in values.values():
-        return
-    chosen = propose_time_steps(problem, **given)
-    config.env.dt, config.env.substeps = chosen.dt, chosen.substeps
-    print(f"time: {chosen.reason}", flush=True)
-
-
-def choose_updates(config: DictConfig, problem: ReachAvoidProblem) -> None:
-    """Replace `auto` in trainer.updates by a number, which grows with the dimensions of V(tau, x) up to two limits."""
-    if config.trainer.get("updates") == AUTO:
-        n = problem.states.dim
-        config.trainer.updates = min(UPDATES_PER_DIMENSION * (n + 1), MOST_UPDATES, max(1, MOST_COORDINATES // n))
-
-
-def choose_paths(config: DictConfig, problem: ReachAvoidProblem) -> None:
-    """Replace `auto` in the numbers of paths of the evaluators by numbers that fall where each path costs much.
-
-    Otherwise the evaluation of a problem with a hundred states would take longer than its training. The time steps must
-    have been chosen before.
-    """
-    simulator = make_evaluation_simulator(config, problem)
-    moves = problem.horizon / simulator.dt * simulator.substeps * problem.states.dim
-    for (evaluator, argument), (most, least) in PATHS.items():
-        if config.evaluation.get(evaluator, {}).get(argument) == AUTO:
-            config.evaluation[evaluator][argument] = max(least, min(most, round(most * CHEAP_PATH / moves)))
-    if config.evaluation.get("progress", {}).get("episodes") == AUTO:
-        episodes = convert(config.evaluation.success.episodes, int, "evaluation.success.episodes")
-        config.evaluation.progress.episodes = max(1, episodes // PROGRESS_SHARE)
-
-
-def choose_probes(config: DictConfig, problem: ReachAvoidProblem) -> str:
-    """Replace `auto` in loss.hjb_probes by a number, and give the reason where the trace is estimated, else ""."""
-    # What is no node of settings is refused where the loss is built.
-    if not isinstance(config.loss, DictConfig) or config.loss.get("hjb_probes") != AUTO:
-        return ""
-    channels = noise_channels(problem)
-    config.loss.hjb_probes = PROBES if channels > MOST_COLUMNS else 0
-    if not config.loss.hjb_probes:
-        return ""
-    instead = f"{PROBES} random vectors in place of {channels} noise channels"
-    return f"The HJB residual takes {instead}; loss.hjb_probes=0 is exact."
 
 
 def _without(config: DictConfig, node: str, key: str) -> DictConfig:

@@ -6,7 +6,8 @@ import pytest
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
-from pirl_rl.assembly import PATHS, make_trainer
+from pirl_rl.assembly import make_trainer
+from pirl_rl.automatic import PATHS
 from pirl_rl.building import build, parameters_of, resolve
 from pirl_rl.commands.composition import arguments, compose, drop_leftovers
 from pirl_rl.commands.methods import check_method, owned

@@ -19,7 +19,8 @@ from torch import Tensor
 
 from pirl_rl import terms
 from pirl_rl.actor_rules import Hamiltonian
-from pirl_rl.assembly import MOST_COLUMNS, PROBES, choose_probes, make_problem, make_trainer
+from pirl_rl.assembly import make_problem, make_trainer
+from pirl_rl.automatic import MOST_COLUMNS, PROBES, choose_probes
 from pirl_rl.checkpoint import load
 from pirl_rl.commands.composition import compose
 from pirl_rl.errors import ArgumentError, Interrupted

@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from pirl_rl.assembly import choose_paths, choose_time_steps, choose_updates, make_problem, make_trainer
+from pirl_rl.assembly import make_evaluation_simulator, make_problem, make_trainer
+from pirl_rl.automatic import choose_paths, choose_time_steps, choose_updates
 from pirl_rl.commands.composition import compose
 from pirl_rl.configuration import load_config, save_config
 from pirl_rl.errors import ArgumentError, ConfigError
@@ -250,7 +251,7 @@ def test_evaluation_plays_fewer_paths_where_they_cost_more(experiment, episodes,
     config = compose("train", typed)
     problem = make_problem(config)
     choose_time_steps(config, problem)
-    choose_paths(config, problem)
+    choose_paths(config, problem, make_evaluation_simulator(config, problem))
     assert (config.evaluation.success.episodes, config.evaluation.calibration.rollouts) == (episodes, rollouts)
     assert config.evaluation.progress.episodes == episodes // 5
 
@@ -258,5 +259,5 @@ def test_evaluation_plays_fewer_paths_where_they_cost_more(experiment, episodes,
 def test_numbers_of_paths_that_are_given_stay():
     config = compose("train", ["+experiment=reach1d", "evaluation.success.episodes=77"])
     choose_time_steps(config, Safety1D())
-    choose_paths(config, Safety1D())
+    choose_paths(config, Safety1D(), make_evaluation_simulator(config, Safety1D()))
     assert (config.evaluation.success.episodes, config.evaluation.progress.episodes) == (77, 15)

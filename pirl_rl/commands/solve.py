@@ -11,14 +11,8 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from pirl_rl.assembly import (
-    choose_paths,
-    choose_time_steps,
-    make_evaluation_simulator,
-    make_evaluators,
-    make_grid_solver,
-    make_problem,
-)
+from pirl_rl.assembly import make_evaluation_simulator, make_evaluators, make_grid_solver, make_problem
+from pirl_rl.automatic import choose_paths, choose_time_steps
 from pirl_rl.commands.directory import show_run
 from pirl_rl.configuration import save_config
 from pirl_rl.evaluation import evaluate, meanings_of, metrics_of, statements_of
@@ -53,7 +47,7 @@ def solve(
     solver = make_grid_solver(config, problem, trust)
     check_problem(problem)
     choose_time_steps(config, problem)
-    choose_paths(config, problem)
+    choose_paths(config, problem, make_evaluation_simulator(config, problem))
     print(f"solving on a grid of {' x '.join(map(str, solver.points))} nodes across the box of states", flush=True)
     started = time.perf_counter()
     # Evaluators and figures take what has the methods of a solution.
