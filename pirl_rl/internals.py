@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 from torchrl.collectors import Collector
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.objectives import TD3Loss
+from torchrl.objectives import SoftUpdate, TD3Loss
 
 from pirl_rl.schedules import WEIGHTS
 
 __all__ = [
+    "FusedSoftUpdate",
     "ScheduledTD3Loss",
     "carried",
     "lock_writes_with",
@@ -23,6 +26,24 @@ class ScheduledTD3Loss(TD3Loss):
     """TD3's loss with the weights of the critic loss as buffers, which an assignment changes in place."""
 
     _schedulable_buffers = frozenset(WEIGHTS)
+
+
+class FusedSoftUpdate(SoftUpdate):
+    """TorchRL's updater of target networks, with one fused operation for all tensors.
+
+    For networks of this size `SoftUpdate.step` spends 20 times as long, on its way to the single tensors.
+    """
+
+    def __init__(self, loss: TD3Loss, tau: float):
+        super().__init__(loss, tau=tau)
+        sources: Any = self._sources
+        pairs = [(self._targets[f"target_{name}"].data, source.data) for name, source in sources.items()]
+        self._followed = [entry for _, source in pairs for entry in source.values(True, True)]
+        self._followers = [target[key] for target, source in pairs for key in source.keys(True, True)]
+
+    @torch.no_grad()
+    def step(self) -> None:
+        get_ema_multi_avg_fn(self.eps)(self._followers, self._followed, None)
 
 
 def carried(collector: Collector) -> TensorDictBase:

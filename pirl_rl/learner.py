@@ -10,11 +10,11 @@ from typing import Any, Literal
 import torch
 from tensordict import TensorDictBase, TensorDictParams
 from torch import Tensor
-from torchrl.objectives import SoftUpdate
 
 from pirl_rl.compilation import compiled, is_compiler_failure, reason_of
 from pirl_rl.curriculum import StageSettings
 from pirl_rl.errors import ArgumentError, DivergenceError
+from pirl_rl.internals import FusedSoftUpdate
 from pirl_rl.losses import PIRLLoss
 from pirl_rl.optimizers import optimizers
 from pirl_rl.schedules import WEIGHTS, Weights
@@ -79,7 +79,7 @@ class Learner:
         if target_warmup < 0:
             raise ArgumentError(f"learner.target_warmup: expected a number >= 0, got {target_warmup}")
         self.polyak, self.target_warmup = polyak, target_warmup
-        self.targets = SoftUpdate(loss, tau=polyak)
+        self.targets = FusedSoftUpdate(loss, tau=polyak)
         self.critic_optimizers = optimizers(loss.qvalue_network_params, learning_rate, optimizer)
         self.actor_optimizers = optimizers(loss.actor_network_params, learning_rate, optimizer)
         self.train_actor = True
