@@ -55,6 +55,7 @@ reference_rooms = {
         "Problems, sets and payoffs",
         [
             "pirl_rl.problem",
+            "pirl_rl.structure",
             "pirl_rl.sets",
             "pirl_rl.payoffs",
             "pirl_rl.problems.cartpole",

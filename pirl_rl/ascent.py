@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from pirl_rl.arguments import Policy
-from pirl_rl.problem import has_controlled_noise
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
+from pirl_rl.structure import has_controlled_noise
 
 Objective = Callable[[Tensor], Tensor]
 """Maps actions (N, m), normalised to [-1, 1], to numbers (N,), each of which depends on its own action alone.
@@ -38,7 +38,7 @@ def hamiltonian(solution: Solution, tau: Tensor, x: Tensor, controlled_noise: bo
         solution: gives V, whose action is frozen at the policy's, and the problem.
         tau: times to go (N,), in s.
         x: states (N, n).
-        controlled_noise: whether sigma depends on u, see `pirl_rl.problem.has_controlled_noise`.
+        controlled_noise: whether sigma depends on u, see `pirl_rl.structure.has_controlled_noise`.
     """
     problem, slope = solution.problem, solution.gradient(tau, x)
     curvature = solution.hessian(tau, x) if controlled_noise else None
@@ -189,16 +189,22 @@ def ascend(objective: Objective, action: Tensor, levels: Tensor, sweeps: int = 1
     return action, best
 
 
-def improved(objective: Objective, action: Tensor, levels: Tensor) -> tuple[Tensor, Tensor]:
+def improved(objective: Objective, action: Tensor, levels: Tensor, inertia: float = 0.0) -> tuple[Tensor, Tensor]:
     """The best level of each coordinate while the others stand still, for all coordinates in one call of the objective.
 
     If H is a sum of functions of one coordinate each, the best levels together are the maximum over the levels. Where
     they are worse together than the best of them alone, that one alone is taken.
 
+    Inertia decides between levels that are nearly as good as each other: from an action to each level, the objective
+    loses this share of its range over the levels for each unit of their distance. Between the two maxima of a function
+    whose minimum lies in the middle, an action then goes to one and stays there. Where the objective is affine in a
+    coordinate, the best of two bounds stays the best with any inertia below 1/2.
+
     Args:
         objective: the function to maximise, for actions (*, N, m).
         action: the action (N, m) that is improved.
         levels: the levels (k,) of each coordinate, bounds included.
+        inertia: that share, >= 0.
 
     Returns:
         The action (N, m), whose objective is at least that of the given one, and how much each coordinate matters
@@ -207,12 +213,14 @@ def improved(objective: Objective, action: Tensor, levels: Tensor) -> tuple[Tens
     size = action.shape[-1]
     own = torch.eye(size, dtype=torch.bool, device=action.device)[:, None, None]
     values, before = objective(torch.where(own, levels[:, None, None], action)), objective(action)
-    top, index = values.max(1)
+    stakes = torch.maximum(values.amax(1), before) - torch.minimum(values.amin(1), before)
+    distance = (levels[:, None, None] - action.mT).abs().movedim(0, 1)
+    index = (values - inertia * stakes.unsqueeze(1) * distance).argmax(1)
+    top = values.gather(1, index.unsqueeze(1)).squeeze(1)
     together = torch.where(top > before, levels[index], action.mT).mT
     alone, which = top.max(0)
     single = torch.where(torch.nn.functional.one_hot(which, size).bool(), together, action)
     best = torch.where((objective(together) >= alone).unsqueeze(-1), together, single)
-    stakes = torch.maximum(top, before) - torch.minimum(values.amin(1), before)
     return best, stakes.mT
 
 

@@ -6,8 +6,9 @@ from omegaconf import DictConfig
 
 from pirl_rl.building import convert
 from pirl_rl.errors import ArgumentError, ConfigError
-from pirl_rl.problem import ReachAvoidProblem, check_problem, noise_channels
+from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
+from pirl_rl.structure import check_problem, noise_channels
 from pirl_rl.time_steps import check_time_steps, propose_time_steps
 
 AUTO = "auto"

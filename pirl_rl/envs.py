@@ -24,10 +24,11 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from pirl_rl.errors import ArgumentError
-from pirl_rl.problem import ReachAvoidProblem, check_problem
+from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.initial_states import InitialStates, UniformStates
 from pirl_rl.sampling.supply import Supply
 from pirl_rl.simulator import Simulator, Step, exit_value
+from pirl_rl.structure import check_problem
 
 
 class ReachAvoidEnv(EnvBase):

@@ -28,8 +28,9 @@ from torch import Tensor
 from pirl_rl.clock import Clock
 from pirl_rl.compilation import Compiled
 from pirl_rl.errors import ArgumentError
-from pirl_rl.problem import ReachAvoidProblem, noise_channels
+from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sigma import constant_matrix, times, transposed_times
+from pirl_rl.structure import noise_channels
 
 
 class Step(NamedTuple):

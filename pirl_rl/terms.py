@@ -16,7 +16,8 @@ from torch import Tensor, nn
 from pirl_rl.errors import ArgumentError
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.operators import generator, masked_mean, rademacher
-from pirl_rl.problem import ReachAvoidProblem, noise_channels
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.structure import noise_channels
 
 TD_CRITERIA = ("squares", "cross_entropy")
 

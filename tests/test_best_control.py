@@ -14,10 +14,10 @@ from pirl_rl.actor_rules import BestControl, Hamiltonian
 from pirl_rl.ascent import ascend, continued_value, expected_ahead, hamiltonian, improved, value_ahead
 from pirl_rl.errors import ArgumentError
 from pirl_rl.networks import Actor, Critic, stack
-from pirl_rl.problem import has_controlled_noise
 from pirl_rl.problems import Reach1D
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
+from pirl_rl.structure import has_controlled_noise
 
 
 class Steered(ReachAvoidProblem):
@@ -180,6 +180,23 @@ def test_coordinates_that_are_worse_together_are_not_changed_together():
     assert best.tolist() == [[1.0, 0.0]]
 
 
+@pytest.mark.parametrize(("tilt", "inertia", "expected"), [(0.05, 0.0, 1.0), (0.05, 0.1, -1.0), (0.5, 0.1, 1.0)])
+def test_inertia_decides_between_levels_that_are_nearly_as_good(tilt, inertia, expected):
+    """f(a) = |a| + tilt a from -0.8: the penalty of the bound 1 exceeds that of -1 by 0.1 * 1.6 of the range."""
+    start, levels = torch.tensor([[-0.8]]), torch.tensor([-1.0, 0.0, 1.0])
+    best, stakes = improved(lambda a: (a.abs() + tilt * a).squeeze(-1), start, levels, inertia)
+    assert best.item() == expected
+    assert stakes.item() == pytest.approx(1 + tilt)
+
+
+def test_inertia_does_not_matter_where_the_objective_is_affine():
+    problem = Steered()
+    solution, (tau, x) = solution_of(problem), points(problem)
+    objective, levels = hamiltonian(solution, tau, x, False), torch.tensor([-1.0, 1.0])
+    start = 2 * torch.rand(len(x), 3, generator=torch.Generator().manual_seed(3)) - 1
+    assert torch.equal(improved(objective, start, levels, 0.1)[0], improved(objective, start, levels)[0])
+
+
 @pytest.mark.parametrize("controlled", [False, True])
 def test_an_improvement_is_none_for_the_worse(controlled):
     problem = Steered(controlled)
@@ -271,9 +288,9 @@ def test_masked_points_do_not_count():
 
 
 def test_what_the_rule_refuses():
-    with pytest.raises(ArgumentError, match="steps >= 0, levels >= 2 and budget >= 1, got 0, 1 and 8192"):
+    with pytest.raises(ArgumentError, match=r"inertia >= 0, got 0, 1, 8192 and 0\.1"):
         BestControl(Reach1D(), Simulator(Reach1D(), 0.1), levels=1)
-    with pytest.raises(ArgumentError, match="budget >= 1, got 0, 2 and 0"):
+    with pytest.raises(ArgumentError, match=r"inertia >= 0, got 0, 2, 0 and 0\.1"):
         BestControl(Reach1D(), Simulator(Reach1D(), 0.1), budget=0)
     with pytest.raises(ArgumentError, match=r"expected critic\.action_input=false"):
         BestControl(Reach1D(), Simulator(Reach1D(), 0.1)).check(Critic(Reach1D(), action_input=True))

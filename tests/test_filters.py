@@ -18,11 +18,12 @@ from pirl_rl.filters import MODES, nearest_action, values_ahead
 from pirl_rl.grid import GridSolver
 from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.operators import generator
-from pirl_rl.problem import ReachAvoidProblem, is_control_affine
+from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems import DubinsCar, Exit1D, HalfSpace, Pendulum, PlanarQuadrotor, Reach1D, VehicleDrift
 from pirl_rl.problems.first_passage import first_passage
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
+from pirl_rl.structure import is_control_affine
 
 
 class Exact(Solution):

@@ -148,7 +148,7 @@ def test_every_constructor_argument_is_a_key(overrides):
     for key, node in found.items():
         # The collector's law of starts is mixed with that of the environment, which stands there.
         # An experiment replaces the actor rule, whose arguments therefore stand nowhere.
-        supplied = {"collector.initial_states": {"others"}, "loss.actor_rule": {"steps", "levels", "budget"}}
+        supplied = {"collector.initial_states": {"others"}, "loss.actor_rule": {"steps", "levels", "budget", "inertia"}}
         supplied = supplied.get(key, set())
         assert {*node} | supplied >= {*arguments(node._target_)}, key
 

@@ -16,12 +16,12 @@ from pirl_rl.evaluation.reference_states import ReferenceStates, displaced
 from pirl_rl.figures import draw
 from pirl_rl.figures.one_dimensional import evaluate_on_grid
 from pirl_rl.figures.planes import broken_at_seams
-from pirl_rl.problem import check_problem
 from pirl_rl.sampling.boundary import BoundarySampler
 from pirl_rl.sampling.collocation import Collocation, ReplayCollocation
 from pirl_rl.sampling.initial_states import UniformStates, VisitedStates
 from pirl_rl.sets import Box, Plane
 from pirl_rl.simulator import Simulator
+from pirl_rl.structure import check_problem
 
 PROBLEM = Circle()
 

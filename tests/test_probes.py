@@ -27,9 +27,9 @@ from pirl_rl.errors import ArgumentError, Interrupted
 from pirl_rl.losses import PIRLLoss
 from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.operators import generator, rademacher
-from pirl_rl.problem import noise_channels
 from pirl_rl.problems import HalfSpace, Reach1D
 from pirl_rl.run_directory import RunDirectory
+from pirl_rl.structure import noise_channels
 from pirl_rl.terms import target_action
 
 HJB_ALONE = (0.0, 1.0, 0.0)

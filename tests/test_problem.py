@@ -14,9 +14,10 @@ from pirl_rl.errors import ArgumentError, ProblemError
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.operators import generator
 from pirl_rl.payoffs import LipschitzPayoff
-from pirl_rl.problem import ReachAvoidProblem, check_problem, has_controlled_noise
+from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems import Exit1D, HalfSpace, RadialExit, Reach1D, Safety1D
 from pirl_rl.sets import Box
+from pirl_rl.structure import check_problem, has_controlled_noise
 
 GOLDEN = np.load(Path(__file__).parent / "data" / "reach1d_value.npz")
 

@@ -12,7 +12,6 @@ from test_planes import Known
 from pirl_rl import Box, ReachAvoidProblem
 from pirl_rl.errors import ProblemError
 from pirl_rl.evaluation.planes import coordinate_plane
-from pirl_rl.problem import check_problem
 from pirl_rl.problems import CartPole, DoubleIntegrator, HalfSpace, PlanarQuadrotor, Reach1D, VehicleDrift, ZermeloBoat
 from pirl_rl.reports.curves import MOST_POINTS, training_curves
 from pirl_rl.reports.equations import MOST_ROWS, equations
@@ -20,6 +19,7 @@ from pirl_rl.reports.maps import MOST_SLIDERS, plane_maps
 from pirl_rl.reports.names import as_html, as_mathml, control_names, split_unit, state_names
 from pirl_rl.reports.outlines import outlines
 from pirl_rl.reports.statement import Statement
+from pirl_rl.structure import check_problem
 
 
 def plain(equation: str) -> str:

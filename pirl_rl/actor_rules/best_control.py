@@ -14,9 +14,10 @@ from pirl_rl.ascent import Flow, Objective, expected_ahead, hamiltonian, improve
 from pirl_rl.errors import ArgumentError
 from pirl_rl.networks import Critic
 from pirl_rl.operators import masked_mean
-from pirl_rl.problem import ReachAvoidProblem, has_controlled_noise, is_control_affine, noise_channels
+from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
+from pirl_rl.structure import has_controlled_noise, is_control_affine, noise_channels
 
 
 class BestControl(ActorRule):
@@ -50,9 +51,13 @@ class BestControl(ActorRule):
             the actor does not cost more with more controls. Where candidates are simulated, it is the largest number of
             simulated states. Each level of each control at each point then needs `steps` of them for a look ahead, and
             2w for the cubature with w noise channels.
+        inertia: how much better than a nearer level another must be, >= 0, see `pirl_rl.ascent.improved`. Noise that
+            grows with |u| has two good bounds beside a convex obstacle, with the worst control between them. Without
+            inertia the best of both changes with each small change of V, and an actor that follows comes to rest
+            between them.
 
     Raises:
-        ArgumentError: `steps` is below 0, `levels` below 2, or `budget` below 1.
+        ArgumentError: `steps` or `inertia` is below 0, `levels` below 2, or `budget` below 1.
     """
 
     def __init__(
@@ -62,14 +67,16 @@ class BestControl(ActorRule):
         steps: int = 0,
         levels: int | None = None,
         budget: int = 8_192,
+        inertia: float = 0.1,
     ):
         if levels is None:
             levels = 2 if steps == 0 and is_control_affine(problem) else 5
-        if steps < 0 or levels < 2 or budget < 1:
+        if steps < 0 or levels < 2 or budget < 1 or inertia < 0:
             raise ArgumentError(
-                f"actor_rule: expected steps >= 0, levels >= 2 and budget >= 1, got {steps}, {levels} and {budget}"
+                "actor_rule: expected steps >= 0, levels >= 2, budget >= 1 and inertia >= 0, "
+                f"got {steps}, {levels}, {budget} and {inertia}"
             )
-        self.simulator, self.steps, self.levels = simulator, steps, levels
+        self.simulator, self.steps, self.levels, self.inertia = simulator, steps, levels, inertia
         self.controlled_noise, self.compiles_whole = has_controlled_noise(problem), steps == 0
         channels, controls = noise_channels(problem), problem.controls.dim
         self.cubature = steps == 0 and self.controlled_noise and channels * controls <= 64
@@ -83,7 +90,8 @@ class BestControl(ActorRule):
         with torch.no_grad():
             action = torch.tanh(logits)
             objective = self._objective(solution, tau.squeeze(-1), x)
-            best, weight = improved(objective, action, torch.linspace(-1, 1, self.levels).to(action))
+            levels = torch.linspace(-1, 1, self.levels).to(action)
+            best, weight = improved(objective, action, levels, self.inertia)
         # pi = tanh(z) is 2 sigmoid(2 z) - 1, so that 2 z is the logit of (1 + pi)/2.
         entropy = torch.nn.functional.binary_cross_entropy_with_logits(2 * logits, (1 + best) / 2, reduction="none")
         duration = self.simulator.dt if self.steps or self.cubature else 1.0

@@ -8,8 +8,9 @@ from torch import Tensor
 
 from pirl_rl.actor_rules.base import ActorRule
 from pirl_rl.operators import advection, generator, masked_mean
-from pirl_rl.problem import ReachAvoidProblem, has_controlled_noise
+from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.solution import Solution
+from pirl_rl.structure import has_controlled_noise
 
 
 class Hamiltonian(ActorRule):

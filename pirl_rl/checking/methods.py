@@ -10,7 +10,7 @@ from torch import Tensor
 from pirl_rl.checking.findings import Finding, found, raised_in
 from pirl_rl.checking.samples import LEVELS, Function, Samples
 from pirl_rl.errors import ProblemError
-from pirl_rl.problem import check_problem
+from pirl_rl.structure import check_problem
 
 FEW = 16
 """The number of states at which types and batches are checked."""

@@ -18,9 +18,10 @@ from pirl_rl.configuration import save_config
 from pirl_rl.evaluation import evaluate, meanings_of, metrics_of, statements_of
 from pirl_rl.files import replacing
 from pirl_rl.machine import record_session
-from pirl_rl.problem import ReachAvoidProblem, check_problem
+from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.reports.meanings import GRID
 from pirl_rl.run_directory import RunDirectory
+from pirl_rl.structure import check_problem
 
 
 def solve(

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from pirl_rl.ascent import ascend, hamiltonian, replaced
-from pirl_rl.problem import has_controlled_noise
 from pirl_rl.solution import Solution
+from pirl_rl.structure import has_controlled_noise
 
 EXHAUSTIVE = 25
 """The largest number of controls of which every one is tried."""

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from pirl_rl.errors import ArgumentError
-from pirl_rl.problem import is_control_affine
 from pirl_rl.solution import Solution
+from pirl_rl.structure import is_control_affine
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pirl_rl.problem import ReachAvoidProblem, is_control_affine
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.structure import is_control_affine
 
 FEW = 32
 """The largest number of candidates in a tensor product where vertices are enough: three controls have 27."""

@@ -23,7 +23,8 @@ from scipy import sparse
 
 from pirl_rl.grid.mesh import Mesh, absorbed
 from pirl_rl.grid.stencil import bounded, decompose
-from pirl_rl.problem import ReachAvoidProblem, has_controlled_noise
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.structure import has_controlled_noise
 
 LOOKS = 4
 """Number of points of an arm at which A and B are looked for; a set that passes between them is not seen."""

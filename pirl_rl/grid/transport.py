@@ -21,7 +21,8 @@ import torch
 from scipy.ndimage import map_coordinates, spline_filter
 
 from pirl_rl.grid.mesh import Mesh, absorbed
-from pirl_rl.problem import ReachAvoidProblem, has_controlled_noise
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.structure import has_controlled_noise
 
 WEAK = 2.0
 """h |f| / sigma^2 along an axis, from which the noise is weak beside the mesh: there the chain is upwind."""

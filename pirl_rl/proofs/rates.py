@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pirl_rl.problem import has_controlled_noise
 from pirl_rl.proofs.points import States
+from pirl_rl.structure import has_controlled_noise
 
 Policy = Callable[[Tensor, Tensor], Tensor]
 """Maps tau (N,) and x (N, n), float64, to the control (N, m) in SI units."""

@@ -10,11 +10,12 @@ from typing import Any
 
 from markupsafe import Markup
 
-from pirl_rl.problem import ReachAvoidProblem, noise_channels
+from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.reports.equations import MOST_ROWS, equations
 from pirl_rl.reports.names import as_html, control_names, split_unit, state_names
 from pirl_rl.reports.outlines import outlines
 from pirl_rl.sets import Box, Plane
+from pirl_rl.structure import noise_channels
 
 
 @dataclass(frozen=True)

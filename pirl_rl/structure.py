@@ -1,0 +1,126 @@
+"""The structure of a problem, judged at random states and controls.
+
+It has the number of noise channels, how drift and noise depend on the control, and whether all parts fit together.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pirl_rl.errors import ProblemError
+from pirl_rl.problem import ReachAvoidProblem
+
+ROUNDING = 1e-9
+"""The relative difference from an affine drift, in double precision, that counts as rounding."""
+
+PERIOD_POINTS = 1_000
+"""The number of states at which both ends of a period are compared."""
+
+PERIOD_TOLERANCE = 1e-4
+"""The relative difference at both ends of a period that counts as rounding, also of a function in single precision."""
+
+
+def noise_channels(problem: ReachAvoidProblem) -> int:
+    """The number w of columns of sigma."""
+    x, u = (box.denormalize(torch.zeros(1, box.dim)) for box in (problem.states, problem.controls))
+    return problem.diffusion(x, u).shape[-1]
+
+
+def has_controlled_noise(problem: ReachAvoidProblem, points: int = 256, seed: int = 0) -> bool:
+    """Whether sigma depends on u, judged by `points` sampled states, each with two sampled controls."""
+    rng = torch.Generator().manual_seed(seed)
+    x = problem.states.sample(points, rng)
+    one, other = (problem.diffusion(x, problem.controls.sample(points, rng)) for _ in range(2))
+    return not torch.equal(one, other)
+
+
+def is_control_affine(problem: ReachAvoidProblem, points: int = 256, seed: int = 0) -> bool:
+    """Whether the drift is affine in u and sigma does not depend on u, judged at random states and controls.
+
+    Args:
+        problem: the physics.
+        points: the number of states, each with two controls and a random point on the line through them.
+        seed: of the points.
+    """
+    rng = torch.Generator().manual_seed(seed)
+    x = problem.states.sample(points, rng, torch.float64)
+    one, other = (problem.controls.sample(points, rng, torch.float64) for _ in range(2))
+    share = torch.rand(points, 1, generator=rng, dtype=torch.float64)
+    expected = (1 - share) * problem.drift(x, one) + share * problem.drift(x, other)
+    gap = (problem.drift(x, (1 - share) * one + share * other) - expected).abs()
+    return bool((gap <= ROUNDING * expected.abs().amax(0)).all()) and not has_controlled_noise(problem, points, seed)
+
+
+def check_problem(problem: ReachAvoidProblem, points: int = 100_000, seed: int = 0) -> None:
+    """Refuse a problem whose parts are missing, have wrong shapes, or contradict each other.
+
+    Args:
+        problem: the problem to check.
+        points: the number of states, uniform in the box `states` expanded by 1.5, at which A and B must not overlap.
+        seed: the seed of these states.
+
+    Raises:
+        ProblemError: an attribute is missing, the horizon is not positive or not finite, a control is periodic, names
+            of coordinates are not as many as the coordinates, an output has the wrong shape or differs at both ends of
+            a period, or a sampled state lies in both A and B.
+    """
+    name = type(problem).__name__
+    for attribute in ("horizon", "states", "controls"):
+        if not hasattr(problem, attribute):
+            raise ProblemError(f"{name} has no {attribute}")
+    if not 0 < problem.horizon < float("inf"):
+        raise ProblemError(f"{name}: horizon must be positive and finite, got {problem.horizon}")
+    if problem.controls.periodic:
+        raise ProblemError(f"{name}.controls: only states may be periodic, got {problem.controls}")
+    for attribute, box in (("state_names", problem.states), ("control_names", problem.controls)):
+        names = getattr(problem, attribute)
+        if names and (isinstance(names, str) or [type(entry) for entry in names] != [str] * box.dim):
+            raise ProblemError(f"{name}.{attribute}: expected {box.dim} names, got {names!r}")
+    rng = torch.Generator().manual_seed(seed)
+    x = problem.states.expand(1.5).sample(points, rng, dtype=torch.float64)
+    u = problem.controls.sample(16, rng, dtype=torch.float64)
+    few, n = x[:16], problem.states.dim
+    _expect_shape(f"{name}.drift", problem.drift(few, u), (16, n))
+    sigma = problem.diffusion(few, u)
+    if sigma.ndim != 3:
+        raise ProblemError(f"{name}.diffusion: expected shape (*, {n}, w), got {tuple(sigma.shape)} for 16 states")
+    _expect_shape(f"{name}.diffusion", sigma, (16, n, sigma.shape[-1]))
+    _expect_shape(f"{name}.avoid_level", problem.avoid_level(few), (16,))
+    if problem.objective == "reach-avoid":
+        _expect_shape(f"{name}.target_level", problem.target_level(few), (16,))
+        both = (problem.target_level(x) <= 0) & problem.failed(x)
+        if both.any():
+            point = [round(value, 6) for value in x[both][0].tolist()]
+            raise ProblemError(
+                f"{name}: target and avoid set overlap, expected disjoint sets; {int(both.sum())} of {points} "
+                f"sampled points lie in both, for example x = {point}"
+            )
+    for axis in problem.states.periodic:
+        _expect_period(problem, axis, x[:PERIOD_POINTS], problem.controls.sample(PERIOD_POINTS, rng, torch.float64))
+
+
+def _expect_period(problem: ReachAvoidProblem, axis: int, x: Tensor, u: Tensor) -> None:
+    """Refuse functions that differ at both ends of a periodic axis, at the other coordinates of x (N, n)."""
+    low, high = x.clone(), x.clone()
+    low[:, axis], high[:, axis] = problem.states.low[axis], problem.states.high[axis]
+    functions = {
+        "drift": problem.drift,
+        "diffusion": problem.diffusion,
+        # The levels may differ there, as long as the sets do not.
+        "membership of the target": lambda x, u: problem.reached(x).double(),
+        "membership of the avoid set": lambda x, u: problem.failed(x).double(),
+    }
+    for what, function in functions.items():
+        one, other = function(low, u), function(high, u)
+        if not torch.allclose(one, other, rtol=PERIOD_TOLERANCE, atol=PERIOD_TOLERANCE * float(one.abs().max())):
+            raise ProblemError(
+                f"{type(problem).__name__}: axis {axis} of states is periodic, so its {what} must be the same at both "
+                f"ends of the period, {problem.states.low[axis]:g} and {problem.states.high[axis]:g}, got a difference "
+                f"of up to {float((one - other).abs().max()):g}"
+            )
+
+
+def _expect_shape(what: str, value: Tensor, shape: tuple[int, ...]) -> None:
+    if tuple(value.shape) != shape:
+        raise ProblemError(f"{what}: expected shape {shape} for 16 states, got {tuple(value.shape)}")
