@@ -17,11 +17,11 @@ AUTO = "auto"
 Keys that take it: env.dt, env.substeps, trainer.updates, loss.hjb_probes and the entries of `PATHS`.
 """
 
-UPDATES_PER_DIMENSION, MOST_UPDATES = 2_300, 16_000
-"""The number of updates that is chosen for each dimension of (tau, x), and the largest that is chosen."""
+UPDATES_PER_DIMENSION, FEW_STATES, UPDATES_OF_MANY = 2_300, 3, 2_900
+"""The number of updates that is chosen for each dimension of (tau, x), up to which number of states, and beyond it."""
 
-MOST_COORDINATES = 900_000
-"""The largest number of updates times states that is chosen: with a hundred states each update takes long."""
+BASE_COST, MOST_COST = 80, 1_700_000
+"""An update of a run takes about as long as this number plus that of the states; the largest sum that is chosen."""
 
 PATHS = {
     ("success", "episodes"): (10_000, 1_000),
@@ -67,10 +67,11 @@ def choose_time_steps(config: DictConfig, problem: ReachAvoidProblem) -> None:
 
 
 def choose_updates(config: DictConfig, problem: ReachAvoidProblem) -> None:
-    """Replace `auto` in trainer.updates by a number, which grows with the dimensions of V(tau, x) up to two limits."""
+    """Replace `auto` in trainer.updates by a number, which grows with the dimensions of V(tau, x) up to a limit."""
     if config.trainer.get("updates") == AUTO:
         n = problem.states.dim
-        config.trainer.updates = min(UPDATES_PER_DIMENSION * (n + 1), MOST_UPDATES, max(1, MOST_COORDINATES // n))
+        each = UPDATES_PER_DIMENSION if n <= FEW_STATES else UPDATES_OF_MANY
+        config.trainer.updates = min(each * (n + 1), max(1, MOST_COST // (BASE_COST + n)))
 
 
 def choose_paths(config: DictConfig, problem: ReachAvoidProblem, simulator: Simulator) -> None:

@@ -229,7 +229,14 @@ def test_a_number_beside_auto_is_kept(capsys):
 
 @pytest.mark.parametrize(
     ("experiment", "updates"),
-    [("reach1d", 4_600), ("zermelo", 6_900), ("dubins", 9_200), ("quadrotor", 16_000), ("halfspace", 9_000)],
+    [
+        ("reach1d", 4_600),
+        ("zermelo", 6_900),
+        ("dubins", 9_200),
+        ("cartpole", 14_500),
+        ("quadrotor", 19_767),
+        ("halfspace", 9_444),
+    ],
 )
 def test_the_length_of_a_run_follows_the_number_of_states(experiment, updates):
     typed = [f"+experiment={experiment}", *(["env.problem.dim=100"] if experiment == "halfspace" else [])]
