@@ -32,8 +32,6 @@ from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from pirl_rl.assembly import make_trainer
@@ -41,7 +39,8 @@ from pirl_rl.building import build, convert
 from pirl_rl.commands.baseline import measure
 from pirl_rl.commands.composition import check_overrides, compose, drop_leftovers, register
 from pirl_rl.commands.console import named_modules, quiet_libraries, reported
-from pirl_rl.commands.start import adopt_networks, method_of
+from pirl_rl.commands.loop_settings import counts_of, overrides_of_training, readable
+from pirl_rl.commands.start import adopt_networks
 from pirl_rl.configuration import CONF
 from pirl_rl.continuation import start_from
 from pirl_rl.errors import INTERRUPTED, ConfigError
@@ -60,18 +59,6 @@ from pirl_rl.progress import helped
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.trainer import Trainer
 
-COUNTS = {"rounds": 1, "extra_rounds": 0, "candidates": 1, "updates": 1, "parallel": 1}
-"""Settings of the loop that are integers, with the smallest value of each."""
-
-OWN = ("start", "out", "advisor", "population", *COUNTS)
-"""Settings of the loop; all others belong to the training of its candidates."""
-
-PLANNED = ("schedule", "stages", "resume", "trainer.updates", "evaluation.final")
-"""Settings that the loop sets for each candidate, so that they are refused on the command line."""
-
-EVALUATIONS = 10
-"""Smallest number of evaluations during a candidate's training. The guard detects a collapse at evaluations only."""
-
 JUDGES = ("success", "residuals", "calibration")
 """Evaluators that the baseline and the candidates are compared by."""
 
@@ -82,12 +69,12 @@ def tune(config: DictConfig) -> None:
     typed = HydraConfig.get().overrides.task
     out = Path(HydraConfig.get().runtime.output_dir)
     with reported(out), _tidy(out), _resumable(out):
-        counts = {name: _count(config, name) for name in COUNTS}
+        counts = counts_of(config)
         if convert(config.population, bool, "population") and counts["parallel"] > 1:
             raise ConfigError(
                 f"parallel: expected 1 with population=true, which is one process, got {counts['parallel']}"
             )
-        train = [*_method(config, typed), *_for_training(typed), *_frequent_evaluation(config)]
+        train = overrides_of_training(config, typed)
         trust = [*config.trust, *named_modules(typed)]
         advisor = build(config.advisor, "advisor", trust)
         trainer, path, final = _first(config, train, trust)
@@ -135,47 +122,6 @@ def _report(out: Path, start: Path) -> None:
         print(f"written  {path}")
     best = history.best
     print(f"best     {start if best.candidate is None else record.run(str(best.checkpoint))}")
-
-
-def _count(config: DictConfig, name: str) -> int:
-    value = convert(config[name], int, name)
-    if not isinstance(value, int) or value < COUNTS[name]:
-        raise ConfigError(f"{name}: expected an integer >= {COUNTS[name]}, got {value!r}")
-    return value
-
-
-def _for_training(typed: Sequence[str]) -> list[str]:
-    """The overrides on the command line that belong to the training of every candidate.
-
-    Raises:
-        ConfigError: for a setting that the loop sets for each candidate.
-    """
-    parser, kept = OverridesParser.create(), []
-    for text in typed:
-        key = parser.parse_override(text).key_or_group
-        if any(_within(key, name) for name in PLANNED):
-            raise ConfigError(f"{text}: expected no {key} here, the loop sets it for every candidate")
-        if not any(_within(key, name) for name in OWN):
-            kept.append(text)
-    return kept
-
-
-def _frequent_evaluation(config: DictConfig) -> list[str]:
-    """An override for experiments that are made for longer runs, with at least `EVALUATIONS` evaluations."""
-    every, most = config.trainer.evaluate_every, max(1, config.updates // EVALUATIONS)
-    return [f"trainer.evaluate_every={most}"] if isinstance(every, int) and every > most else []
-
-
-def _method(config: DictConfig, typed: Sequence[str]) -> list[str]:
-    """An override for the method of the start, whose networks the candidates continue, unless another one was typed."""
-    if any(text.partition("=")[0].lstrip("+") == "method" for text in typed) or not isinstance(config.start, str):
-        return []
-    method = method_of(config.start)
-    return [] if method in (None, config.method_name) else [f"method={method}"]
-
-
-def _within(key: str, name: str) -> bool:
-    return key == name or key.startswith(f"{name}.")
 
 
 def _first(config: DictConfig, train: Sequence[str], trust: Sequence[str]) -> tuple[Trainer, Path, list[str]]:
@@ -245,22 +191,10 @@ def _resumable(out: Path) -> Iterator[None]:
         signal.signal(signal.SIGTERM, previous)
 
 
-def _readable(argument: str) -> str:
-    """Quote the value of `advisor.command` for Hydra, since the shell has removed the user's quotes."""
-    key, _, line = argument.partition("=")
-    if key.lstrip("+") != "advisor.command":
-        return argument
-    try:
-        OverridesParser.create().parse_override(argument)
-    except HydraException:
-        return f"{key}={quoted(line)}"
-    return argument
-
-
 def main() -> None:
     if helped(sys.argv[1:], __doc__):
         return
-    sys.argv[1:] = arguments = [_readable(text) for text in sys.argv[1:]]
+    sys.argv[1:] = arguments = [readable(text) for text in sys.argv[1:]]
     quiet_libraries()
     if "--report" in arguments:
         named = [item.partition("=")[2] for item in arguments if item.startswith("out=")]
