@@ -18,10 +18,10 @@ Keys that take it: env.dt, env.substeps, trainer.updates, loss.hjb_probes and th
 """
 
 UPDATES_PER_DIMENSION, FEW_STATES, UPDATES_OF_MANY = 2_300, 3, 2_900
-"""The number of updates that is chosen for each dimension of (tau, x), up to which number of states, and beyond it."""
+"""The number of updates for each dimension of (tau, x): the first up to `FEW_STATES` states, and the last beyond."""
 
 BASE_COST, MOST_COST = 80, 1_700_000
-"""An update of a run takes about as long as this number plus that of the states; the largest sum that is chosen."""
+"""The time of an update grows with the number n of states as BASE_COST + n. The sum over a run is at most MOST_COST."""
 
 PATHS = {
     ("success", "episodes"): (10_000, 1_000),

@@ -11,10 +11,11 @@ from oracles import PROBLEMS, FullNoise, make_batch, name, nested_generator, poi
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.objectives import TD3Loss
+from torchrl.objectives import SoftUpdate, TD3Loss
 
 from pirl_rl.actor_rules import ActorRule, ClippedSurrogate, Hamiltonian, LookAhead, Q, Sum
 from pirl_rl.errors import ArgumentError
+from pirl_rl.internals import FusedSoftUpdate
 from pirl_rl.losses import PIRLLoss
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.operators import advection, generator
@@ -552,3 +553,25 @@ def test_compiled_equals_eager_and_follows_the_weights():
             gradients(ours, loss.qvalue_network_params), gradients(eager, loss.qvalue_network_params), strict=True
         ):
             assert (mine - other).norm() <= 1e-6 * other.norm()
+
+
+@some_problems
+def test_targets_move_as_torchrl_s_updater_moves_them(problem):
+    """Both updaters start with targets that equal the networks, which are changed before the step."""
+    states = []
+    for updater in (SoftUpdate, FusedSoftUpdate):
+        loss = make_loss(problem)
+        update = updater(loss, tau=0.3)
+        for params in (loss.actor_network_params, loss.qvalue_network_params):
+            for key, entry in params.data.items(True, True):
+                _move(key, entry)
+        update.step()
+        states.append(loss.state_dict())
+    assert states[0].keys() == states[1].keys()
+    assert all(torch.equal(entry, states[1][key]) for key, entry in states[0].items())
+    assert not torch.equal(
+        *(
+            next(e for k, e in states[1].items() if k.startswith(p) and k.endswith("weight"))
+            for p in ("actor", "target_actor")
+        )
+    )
