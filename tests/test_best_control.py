@@ -288,9 +288,13 @@ def test_masked_points_do_not_count():
 
 
 def test_what_the_rule_refuses():
-    with pytest.raises(ArgumentError, match=r"inertia >= 0, got 0, 1, 8192 and 0\.1"):
+    with pytest.raises(
+        ArgumentError, match=r"steps >= 0, levels >= 2, budget >= 1 and inertia >= 0, got 0, 1, 8192 and 0\.1"
+    ):
         BestControl(Reach1D(), Simulator(Reach1D(), 0.1), levels=1)
-    with pytest.raises(ArgumentError, match=r"inertia >= 0, got 0, 2, 0 and 0\.1"):
+    with pytest.raises(ArgumentError, match=r"budget >= 1 and inertia >= 0, got 0, 2, 0 and 0\.1"):
         BestControl(Reach1D(), Simulator(Reach1D(), 0.1), budget=0)
+    with pytest.raises(ArgumentError, match=r"inertia >= 0, got 0, 2, 8192 and -0\.1"):
+        BestControl(Reach1D(), Simulator(Reach1D(), 0.1), inertia=-0.1)
     with pytest.raises(ArgumentError, match=r"expected critic\.action_input=false"):
         BestControl(Reach1D(), Simulator(Reach1D(), 0.1)).check(Critic(Reach1D(), action_input=True))

@@ -51,10 +51,10 @@ class BestControl(ActorRule):
             the actor does not cost more with more controls. Where candidates are simulated, it is the largest number of
             simulated states. Each level of each control at each point then needs `steps` of them for a look ahead, and
             2w for the cubature with w noise channels.
-        inertia: how much better than a nearer level another must be, >= 0, see `pirl_rl.ascent.improved`. Noise that
-            grows with |u| has two good bounds beside a convex obstacle, with the worst control between them. Without
-            inertia the best of both changes with each small change of V, and an actor that follows comes to rest
-            between them.
+        inertia: what a level loses for each unit of its distance from the actor's output when levels are compared, as a
+            share of the range of the Hamiltonian, >= 0; see `pirl_rl.ascent.improved`. Where noise grows with |u|, both
+            bounds are good beside a convex obstacle, and the worst control lies between them. Without inertia the
+            better bound changes with each small change of V, and an actor that follows comes to rest between both.
 
     Raises:
         ArgumentError: `steps` or `inertia` is below 0, `levels` below 2, or `budget` below 1.
