@@ -246,9 +246,11 @@ def test_nothing_is_overwritten_and_a_failure_leaves_nothing(trained, tmp_path, 
     assert [path.name for path in tmp_path.iterdir()] == ["model"]
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
-@pytest.mark.parametrize("problem", [DubinsCar(), PlanarQuadrotor(), Pendulum(), VehicleDrift()])
+@pytest.mark.parametrize(
+    "problem",
+    [Pendulum(), *(pytest.param(p, marks=pytest.mark.slow) for p in (DubinsCar(), PlanarQuadrotor(), VehicleDrift()))],
+)
 def test_the_cpp_example_evaluates_a_model(problem, tmp_path):
     """States in general position: an operator may round the level of a state on a face to the other side."""
     solution = solution_of(problem, critics=2)

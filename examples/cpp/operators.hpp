@@ -85,8 +85,11 @@ inline const std::map<std::string, Unary>& unary_operators() {
     static const std::map<std::string, Unary> table = {
         {"Abs", [](double z) { return std::fabs(z); }},
         {"Acos", [](double z) { return std::acos(z); }},
+        {"Acosh", [](double z) { return std::acosh(z); }},
         {"Asin", [](double z) { return std::asin(z); }},
+        {"Asinh", [](double z) { return std::asinh(z); }},
         {"Atan", [](double z) { return std::atan(z); }},
+        {"Atanh", [](double z) { return std::atanh(z); }},
         {"Ceil", [](double z) { return std::ceil(z); }},
         {"Cos", [](double z) { return std::cos(z); }},
         {"Cosh", [](double z) { return std::cosh(z); }},
