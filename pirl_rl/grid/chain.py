@@ -8,9 +8,17 @@ enters A or B; they are 1 where it does not. The rates forward and backward are
 
 second differences with unequal arms (G. Shortley and R. Weller, Journal of Applied Physics 9, 1938), so that faces of A
 and B lie where the level functions have them, not at nodes. They have the drift c_k lambda_k v_k. These drifts add up
-to the drift F for c_k = v_k . D^-1 F. Since rates must not be negative, c_k is limited to [-1/q, 1/p]. What is left of
-F moves along the axes, as an upwind difference: the rate |R_i| / p for the rest R_i > 0, with p of the arm along R_i.
-Thus the scheme has central differences, of second order, where the noise is strong enough, and is of first order else.
+to the drift F for c_k = v_k . D^-1 F.
+
+These central differences are of second order, but beyond 1/p and -1/q for c_k a rate would be negative, and next to a
+face V may change within a layer of the width 1 / (2 c_k), which is thinner than an arm. There the rates r forward and s
+backward are fitted to the layer instead (A. Il'in, Mathematical Notes 6, 1969): they solve
+
+    r p - s q = c_k lambda_k,   r (1 - e^(-2 c_k p)) = s (e^(2 c_k q) - 1),
+
+so that they have the same drift, and with constant drift and noise the right probability of reaching the end of one arm
+before that of the other. For large c_k they are upwind differences, of first order. What is left of F along axes with
+little or no noise moves by the rate |R_i| / p for the rest R_i > 0, with p of the arm along R_i.
 """
 
 from __future__ import annotations
@@ -31,6 +39,9 @@ LOOKS = 4
 
 BISECTIONS = 12
 """The face is located to a fraction of 1 / (4 * 2^12) of an arm."""
+
+STEEPEST = 20.0
+"""The largest |c_k|, beyond which the drift moves along the axes. After one arm e^-40 is left of such a layer."""
 
 SHORTEST = 1e-3
 """The smallest fraction of an arm; it bounds the rates, and moves a face by at most this share of a node distance."""
@@ -158,9 +169,10 @@ class Chain:
         slope = np.einsum("pij,pj->pi", np.broadcast_to(noise.inverse, (len(drift), *noise.inverse.shape[1:])), drift)
         for weight, offset, forward, backward in noise.directions:
             p, q = forward.fraction, backward.fraction
-            share = (offset * slope).sum(-1).clip(-1 / q, 1 / p)
-            jumps.append((forward, weight * (1 + share * q) / (p * (p + q))))
-            jumps.append((backward, weight * (1 - share * p) / (q * (p + q))))
+            share = (offset * slope).sum(-1).clip(-STEEPEST, STEEPEST)
+            fitted = forward.cut | backward.cut | (share > 1 / p) | (share < -1 / q)
+            ahead, back = _jump_rates(share, p, q, fitted)
+            jumps += [(forward, weight * ahead), (backward, weight * back)]
             rest -= (share * weight)[:, None] * offset
         for axis, (forward, backward) in enumerate(self.axes):
             jumps.append((forward, rest[:, axis].clip(0) / forward.fraction))
@@ -180,3 +192,15 @@ class Chain:
         rates.append(-out)
         entries = np.concatenate(rates), (np.concatenate(rows), np.concatenate(columns))
         return sparse.coo_array(entries, shape=(size, size)).tocsr(), gain
+
+
+def _jump_rates(c: np.ndarray, p: np.ndarray, q: np.ndarray, fitted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rates forward and backward, each (M,), for lambda = 1: central, or `fitted` (M,) bool to a layer."""
+    ahead, back = (1 + c * q) / (p * (p + q)), (1 - c * p) / (q * (p + q))
+    # The two agree up to a share of c^2, and the formula below is lost in rounding where c is nearly 0.
+    layer = fitted & (np.abs(c) > 1e-4)
+    c, p, q = c[layer], p[layer], q[layer]
+    forward, backward = np.expm1(2 * c * q), -np.expm1(-2 * c * p)
+    scale = c / (p * forward - q * backward)
+    ahead[layer], back[layer] = scale * forward, scale * backward
+    return ahead, back
