@@ -54,20 +54,29 @@ class Muon(torch.optim.Optimizer):
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
         for group in self.param_groups:
-            for weight in group["params"]:
-                gradient, state = weight.grad, self.state[weight]
-                momentum = state.setdefault("momentum", torch.zeros_like(weight))
-                momentum.lerp_(gradient, 1 - MOMENTUM)
-                out, into = weight.shape[-2:]
+            # Matrices of one shape are made orthogonal together, which costs less than one after another.
+            for shape in dict.fromkeys(weight.shape for weight in group["params"]):
+                weights = [weight for weight in group["params"] if weight.shape == shape]
+                out, into = shape[-2:]
                 length = RATE * group["lr"] * max(1.0, out / into) ** 0.5
-                weight.sub_(orthogonal(gradient.lerp(momentum, MOMENTUM)), alpha=length)
+                directions = orthogonal(torch.stack([self._direction(weight) for weight in weights]))
+                for weight, direction in zip(weights, directions, strict=True):
+                    weight.sub_(direction, alpha=length)
+
+    def _direction(self, weight: Tensor) -> Tensor:
+        """Nesterov's momentum of a weight, with its gradient taken into account."""
+        momentum = self.state[weight].setdefault("momentum", torch.zeros_like(weight))
+        momentum.lerp_(weight.grad, 1 - MOMENTUM)
+        return weight.grad.lerp(momentum, MOMENTUM)
 
 
 def orthogonal(matrix: Tensor) -> Tensor:
     """Nearly the orthogonal factor U V^T of the matrices (*, out, in) = U S V^T, by Newton-Schulz iterations."""
     a, b, c = COEFFICIENTS
     x = matrix / matrix.norm(dim=(-2, -1), keepdim=True).clamp(min=1e-7)
+    x = x.reshape(-1, *x.shape[-2:])
     for _ in range(ITERATIONS):
         gram = x @ x.mT
-        x = a * x + (b * gram + c * gram @ gram) @ x
-    return x
+        # a x + (b gram + c gram^2) x
+        x = torch.baddbmm(x, torch.baddbmm(gram, gram, gram, beta=b, alpha=c), x, beta=a)
+    return x.reshape(matrix.shape)

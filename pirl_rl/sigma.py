@@ -63,7 +63,7 @@ def transposed_times(sigma: Tensor, a: Tensor) -> Tensor:
 
 
 def _is_one_matrix(sigma: Tensor) -> bool:
-    return all(stride == 0 for stride in sigma.stride()[:-2])
+    return sigma.numel() > 0 and all(stride == 0 for stride in sigma.stride()[:-2])
 
 
 def _one_matrix(sigma: Tensor) -> Tensor:

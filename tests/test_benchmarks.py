@@ -11,6 +11,7 @@ import pytest
 from benchmarks import __main__ as command
 from benchmarks import ratios, time_to_accuracy
 from benchmarks.ratios import WORSE, compare, table
+from pirl_rl.layers import Dense
 
 FAKE = """
 import json, sys
@@ -59,6 +60,17 @@ def test_what_is_stored_belongs_to_the_short_version():
 def test_every_benchmark_is_a_file():
     files = [line.split()[0] for line in (*command.ALL.values(), *command.SHORT.values())]
     assert all((command.FOLDER / file).is_file() for file in files)
+
+
+@pytest.mark.parametrize("experiment", ["reach1d", "drift"])
+def test_peers_compares_networks_of_the_widths_that_it_names(experiment):
+    pytest.importorskip("stable_baselines3", reason="needs the extra baselines")
+    from benchmarks import peers
+
+    loss = peers.ours(experiment).learner.loss
+    for network, widths in ((loss.solution().actor, peers.ACTOR), (loss.solution().critic, peers.CRITIC)):
+        dense = [layer for layer in network.layers if isinstance(layer, Dense)]
+        assert [layer.out_features for layer in dense[:-1]] == [*widths]
 
 
 @pytest.fixture

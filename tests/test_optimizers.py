@@ -39,6 +39,22 @@ def test_steps_agree_with_those_of_torch():
     torch.testing.assert_close(moved[0], moved[1], atol=1e-5, rtol=0)
 
 
+def test_weights_take_the_same_steps_together_as_each_alone():
+    """In double precision, since products of stacked matrices may add up in another order."""
+    rng = torch.Generator().manual_seed(0)
+    start = [torch.randn(shape, generator=rng, dtype=torch.float64) for shape in ((2, 8, 8), (2, 8, 6), (2, 8, 8))]
+    together, alone = ([nn.Parameter(entry.clone()) for entry in start] for _ in range(2))
+    steps = Muon(together, 1e-2), *(Muon([weight], 1e-2) for weight in alone)
+    for _ in range(3):
+        for weight, other in zip(together, alone, strict=True):
+            weight.grad = other.grad = torch.randn(weight.shape, generator=rng, dtype=torch.float64)
+        for optimizer in steps:
+            optimizer.step()
+    for weight, other, begin in zip(together, alone, start, strict=True):
+        assert (weight - begin).norm() > 0.1
+        torch.testing.assert_close(weight, other, rtol=0, atol=1e-12)
+
+
 def test_muon_takes_the_weights_between_hidden_layers_and_adam_the_rest(tmp_path):
     loss = small_trainer(tmp_path, "critic.hidden=[8,8,8]", "actor.hidden=[8]").learner.loss
     [adam, muon] = optimizers(loss.qvalue_network_params, 1e-3, "muon")

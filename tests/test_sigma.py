@@ -19,6 +19,12 @@ def test_products_are_those_of_matrices(one):
     torch.testing.assert_close(transposed_times(sigma, a), torch.einsum("nij,ni->nj", sigma, a))
 
 
+def test_there_may_be_no_states():
+    sigma = torch.eye(3, 2).expand(0, 3, 2)
+    assert times(sigma, torch.zeros(0, 2)).shape == (0, 3)
+    assert transposed_times(sigma, torch.zeros(0, 3)).shape == (0, 2)
+
+
 def in_place(x, u):
     sigma = 0.3 * torch.eye(2).to(x).repeat(len(x), 1, 1)
     sigma[:, 0, 0] = sigma[:, 0, 0] + (x[:, 0] > 100)

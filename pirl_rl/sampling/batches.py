@@ -55,4 +55,4 @@ class BatchSampler:
             parts["collocation"] = self.collocation.sample(self.rng, replay, progress)
         if boundary:
             parts["boundary"] = self.boundary.sample(self.rng, replay)
-        return TensorDict(parts).to(self.device)
+        return TensorDict(parts, device=self.device)
