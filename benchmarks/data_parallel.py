@@ -29,7 +29,7 @@ from benchmarks.record import save
 from benchmarks.time_to_accuracy import PLAIN
 from pirl_rl.assembly import make_trainer
 from pirl_rl.commands.composition import compose
-from pirl_rl.learner import Gradient
+from pirl_rl.gradients import Gradient
 from pirl_rl.trainer import Trainer
 
 SHARED = ("env.num_envs", "collector.frames_per_batch", "collector.warmup_frames", "trainer.batch_size")

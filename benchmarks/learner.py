@@ -32,7 +32,7 @@ from torch import Tensor
 from benchmarks.record import save
 from pirl_rl import compilation
 from pirl_rl.actor_rules import Q
-from pirl_rl.learner import with_gradient
+from pirl_rl.gradients import with_gradient
 from pirl_rl.losses import PIRLLoss
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.problem import ReachAvoidProblem

@@ -74,8 +74,8 @@ def watch(trainer: Trainer, clock: Clock) -> None:
     clock.watch(collector.buffer, "extend", "collector: buffer")
     clock.watch(trainer.batches, "sample", "sampling of the batch")
     clock.watch(learner, "update", "update: the rest")
-    clock.watch(learner, "_critic_loss", "update: critic loss and gradient")
-    clock.watch(learner, "_actor_loss", "update: actor loss and gradient")
+    clock.watch(learner.gradients, "critic", "update: critic loss and gradient")
+    clock.watch(learner.gradients, "actor", "update: actor loss and gradient")
     clock.watch(learner.targets, "step", "update: target networks")
     for name in ("critic", "actor"):
         for optimizer in getattr(learner, f"{name}_optimizers"):

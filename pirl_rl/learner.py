@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase, TensorDictParams
 from torch import Tensor
 
-from pirl_rl.compilation import compiled, is_compiler_failure, reason_of
 from pirl_rl.curriculum import StageSettings
 from pirl_rl.errors import ArgumentError, DivergenceError
+from pirl_rl.gradients import Gradient, Gradients, Terms
 from pirl_rl.internals import FusedSoftUpdate
 from pirl_rl.losses import PIRLLoss
 from pirl_rl.optimizers import optimizers
@@ -22,19 +21,12 @@ from pirl_rl.schedules import WEIGHTS, Weights
 EXPLOSION = 1e6
 """A loss above this is a divergence. Errors of probabilities are at most 1, and useful residuals are far smaller."""
 
-Terms = dict[str, Tensor]
-
-LossFunction = Callable[[TensorDictBase], tuple[Tensor, Terms]]
-"""Maps a batch to a loss, and to terms of it by name."""
-
-Gradient = tuple[Tensor, Terms, tuple[Tensor | None, ...]]
-"""A loss, its terms and its gradient in the parameters."""
-
 
 class Learner:
     """Updates the networks of a loss.
 
     Attributes:
+        gradients: evaluates the losses and their gradients.
         loss_actor: the loss of the actor's last update, NaN before the first.
 
     Args:
@@ -83,11 +75,9 @@ class Learner:
         self.critic_optimizers = optimizers(loss.qvalue_network_params, learning_rate, optimizer)
         self.actor_optimizers = optimizers(loss.actor_network_params, learning_rate, optimizer)
         self.train_actor = True
-        self.compile = compile
+        self.gradients = Gradients(loss, compile)
         self.loss_actor = torch.tensor(math.nan)
         self._moments_rule = _name(loss.actor_rule)
-        self._compile_critic_loss()
-        self._compile_actor_loss()
 
     def apply(self, settings: StageSettings) -> None:
         """Continue with the settings of a stage; a change of the actor rule resets the optimisers of the actor."""
@@ -100,7 +90,7 @@ class Learner:
             self._moments_rule = _name(settings.actor_rule)
         if settings.actor_rule is not self.loss.actor_rule:
             self.loss.actor_rule = settings.actor_rule
-            self._compile_actor_loss()
+            self.gradients.make_actor()
 
     def update(self, batch: TensorDictBase, k: int, weights: Weights, decay: float) -> dict[str, Tensor]:
         """Make one update.
@@ -121,10 +111,10 @@ class Learner:
         """
         self.prepare(weights, decay)
         batch = self.loss.with_noise(batch)
-        terms = self.step_critics(self._differentiated("critic", batch), k)
+        terms = self.step_critics(self.gradients.critic(batch), k)
         if k % self.actor_every == 0:
             if self.train_actor:
-                self.step_actor(self._differentiated("actor", batch), k)
+                self.step_actor(self.gradients.actor(batch), k)
             self.step_targets(k)
         return {**terms, "loss_actor": self.loss_actor}
 
@@ -204,37 +194,6 @@ class Learner:
             for optimizer, saved in zip(own, state[name], strict=True):
                 optimizer.load_state_dict(saved)
 
-    # The next two methods decide what is compiled, and keep it in `_critic_loss`, `_actor_loss` and the actor rule.
-
-    def _compile_critic_loss(self) -> None:
-        self._critic_loss = self._compiler()(with_gradient(self.loss.critic_loss, self.loss.qvalue_network_params))
-
-    def _compile_actor_loss(self) -> None:
-        compiler, rule = self._compiler(), self.loss.actor_rule
-        rule.compile(compiler)
-        differentiated = with_gradient(self.loss.actor_loss, self.loss.actor_network_params)
-        self._actor_loss = compiler(differentiated) if rule.compiles_whole else differentiated
-
-    def _compiler(self) -> Callable[[Any], Any]:
-        return compiled if self.compile else lambda function: function
-
-    def _differentiated(self, which: Literal["critic", "actor"], batch: TensorDictBase) -> Gradient:
-        """A loss, its terms and its gradient. If compilation fails, the losses run eagerly from then on."""
-
-        def evaluate() -> Gradient:
-            return (self._critic_loss if which == "critic" else self._actor_loss)(batch)
-
-        try:
-            return evaluate()
-        except Exception as error:
-            if not self.compile or not is_compiler_failure(error):
-                raise
-            self.compile = False
-            self._compile_critic_loss()
-            self._compile_actor_loss()
-            warnings.warn(f"updates run eagerly, about half as fast: {reason_of(error)}", stacklevel=3)
-            return evaluate()
-
 
 def _check(loss: Tensor, terms: Terms, update: int) -> None:
     if abs(loss.item()) < EXPLOSION:
@@ -258,14 +217,3 @@ def _descend(
 def _name(rule: object) -> str:
     """The full name of the class of a rule, by which a checkpoint records it."""
     return type(rule).__qualname__
-
-
-def with_gradient(function: LossFunction, params: TensorDictParams) -> Callable[[TensorDictBase], Gradient]:
-    """The loss with its gradient in the parameters, so that compiled code computes both in one program."""
-    parameters = tuple(params.parameters())
-
-    def differentiated(batch: TensorDictBase) -> Gradient:
-        loss, terms = function(batch)
-        return loss.detach(), terms, torch.autograd.grad(loss, parameters, allow_unused=True)
-
-    return differentiated

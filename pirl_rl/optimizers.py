@@ -59,15 +59,15 @@ class Muon(torch.optim.Optimizer):
                 weights = [weight for weight in group["params"] if weight.shape == shape]
                 out, into = shape[-2:]
                 length = RATE * group["lr"] * max(1.0, out / into) ** 0.5
-                directions = orthogonal(torch.stack([self._direction(weight) for weight in weights]))
+                directions = orthogonal(torch.stack([self._direction(weight, weight.grad) for weight in weights]))
                 for weight, direction in zip(weights, directions, strict=True):
                     weight.sub_(direction, alpha=length)
 
-    def _direction(self, weight: Tensor) -> Tensor:
-        """Nesterov's momentum of a weight, with its gradient taken into account."""
+    def _direction(self, weight: Tensor, gradient: Tensor) -> Tensor:
+        """Nesterov's momentum of a weight, after a gradient has been added to it."""
         momentum = self.state[weight].setdefault("momentum", torch.zeros_like(weight))
-        momentum.lerp_(weight.grad, 1 - MOMENTUM)
-        return weight.grad.lerp(momentum, MOMENTUM)
+        momentum.lerp_(gradient, 1 - MOMENTUM)
+        return gradient.lerp(momentum, MOMENTUM)
 
 
 def orthogonal(matrix: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ from torch import Tensor
 from pirl_rl import checkpoint
 from pirl_rl.compilation import Compiled
 from pirl_rl.errors import ArgumentError, DivergenceError, Interrupted
-from pirl_rl.learner import Gradient, Terms
+from pirl_rl.gradients import Gradient, Terms
 from pirl_rl.losses import TERMS, PIRLLoss
 from pirl_rl.progress import Progress, announce, interruptible
 from pirl_rl.terms import Networks
@@ -65,7 +65,7 @@ class Population:
             raise ArgumentError("population: expected members with the same updates and networks of the same shapes")
         self.members, self._numbers = members, list(numbers)
         self.errors: dict[int, DivergenceError] = {}
-        self._losses = StackedLosses(members[0].learner.compile)
+        self._losses = StackedLosses(members[0].learner.gradients.compile)
 
     def train(self) -> list[dict[str, float] | None]:
         """Train all members to the last update and evaluate them.

@@ -148,7 +148,7 @@ class Trainer:
             if not self.ended:
                 with interruptible() as interrupted:
                     self.begin()
-                    announce("compiling the losses, and training" if self.learner.compile else "training")
+                    announce("compiling the losses, and training" if self.learner.gradients.compile else "training")
                     self._loop(interrupted)
         except DivergenceError as error:
             self.recover(error)

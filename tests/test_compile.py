@@ -71,7 +71,7 @@ def assert_nothing_ran_eagerly(tmp_path, calls: list[str]) -> None:
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="updates run eagerly")
         trainer = train_over_rules(tmp_path, "compile=true")
-    assert trainer.learner.compile
+    assert trainer.learner.gradients.compile
     assert calls == []
     assert not counters["graph_break"]
 
@@ -152,7 +152,7 @@ def test_compiled_and_eager_trainings_have_the_same_curves(settings, tmp_path):
     for compile in ("true", "false"):
         trainer = small_trainer(tmp_path / compile, *settings, f"compile={compile}")
         trainer.train()
-        assert trainer.learner.compile == (compile == "true")
+        assert trainer.learner.gradients.compile == (compile == "true")
         tables.append(np.genfromtxt(RunDirectory(tmp_path / compile).metrics, delimiter=",", skip_header=1))
     assert len(tables[0]) > 5
     np.testing.assert_allclose(*tables, rtol=1e-6, atol=1e-9)
