@@ -9,7 +9,7 @@ import torch
 
 import pirl_rl
 import pirl_rl.errors
-from pirl_rl import Box, Plane, problems
+from pirl_rl import Box, Plane, ReachAvoidProblem, problems
 from pirl_rl.checking import examine, report
 from pirl_rl.commands.check import main
 from pirl_rl.problems import DoubleIntegrator, DubinsCar, HalfSpace, Pendulum, Reach1D, ZermeloBoat
@@ -305,6 +305,29 @@ def test_thirty_dimensions_give_no_alarm():
     assert report(examine(HalfSpace(dim=30)), ["error", "warning"]) == ""
 
 
+class Orbit(ReachAvoidProblem):
+    """A double integrator in an hour and 100 km. A move by 2 pi metres changes nothing that shows."""
+
+    horizon = 3600.0
+    states, controls = Box([-1e5, -2e2], [1e5, 2e2]), Box([-0.2], [0.2])
+
+    def drift(self, x, u):
+        return torch.stack([x[..., 1], u[..., 0]], -1)
+
+    def diffusion(self, x, u):
+        return x.new_tensor([[20.0, 0.0], [0.0, 1.0]]).expand(*x.shape, 2)
+
+    def target_constraints(self, x):
+        return torch.stack([x[..., 0].abs() - 5e3, x[..., 1].abs() - 20.0], -1)
+
+    def avoid_level(self, x):
+        return 9.5e4 - x[..., 0].abs()
+
+
+def test_large_units_give_no_alarm():
+    assert report(examine(Orbit()), ["error", "warning"]) == ""
+
+
 def test_a_point_and_a_line_are_shown():
     finding = next(finding for finding in examine(Overlap()) if finding.level == "error")
     assert re.search(
@@ -353,7 +376,7 @@ def test_the_command_prints_findings_and_ends_with_an_exit_code(capsys):
         ([], "expected one problem"),
         (["nowhere:Problem"], "no module 'nowhere'"),
         (["pirl_rl.problems:Nothing"], "has no class 'Nothing'"),
-        (["pirl_rl.problems"], "has no class ''"),
+        (["pirl_rl.problems"], "expected my_module:MyProblem, got 'pirl_rl.problems'"),
         (["pirl_rl:Box"], "expected a subclass of pirl_rl.ReachAvoidProblem"),
         (["pirl_rl.problems:HalfSpace", "size=3"], "unexpected keyword argument 'size'"),
         (["pirl_rl.problems:HalfSpace", "dim=0"], "HalfSpace.dim: expected an integer >= 1"),
@@ -366,6 +389,15 @@ def test_a_wrong_command_is_one_line(arguments, message, capsys):
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
+
+
+def test_an_error_in_the_body_of_a_class_is_told_from_a_missing_class(tmp_path, monkeypatch, capsys):
+    source = "import pirl_rl\nclass Empty(pirl_rl.ReachAvoidProblem):\n    states = pirl_rl.Box([], [])\n"
+    (tmp_path / "empty_box.py").write_text(source)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(SystemExit):
+        main(["empty_box:Empty"])
+    assert "error: Box: low and high need the same length >= 1, got 0 and 0" in capsys.readouterr().err
 
 
 def test_training_checks_first_and_leaves_nothing_behind(tmp_path):

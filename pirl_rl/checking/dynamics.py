@@ -25,6 +25,9 @@ ANGLES = (2 * math.pi, 360.0)
 COVERS = 0.9
 """The share of a period that a box covers if its coordinate is an angle which may go all the way round."""
 
+PART = 0.38
+"""A share of a period after which what repeats is not the same."""
+
 THIN = 2.0
 """Moves in one integration step, in depths of a set, from which paths jump over the set."""
 
@@ -95,10 +98,11 @@ def angles(samples: Samples) -> Iterator[Finding]:
         for period in (*ANGLES, width):
             if width < COVERS * period:
                 continue
-            shifted, mixed = x.clone(), x.clone()
+            shifted, between = x.clone(), x.clone()
             shifted[:, axis] += period
-            mixed[:, axis] = mixed[:, axis].roll(1)
-            if _alike(samples, x, shifted, u) and not _alike(samples, x, mixed, u):
+            between[:, axis] += PART * period
+            # Along a coordinate of a much larger scale nothing changes after a part of the period either.
+            if _alike(samples, x, shifted, u) and not _alike(samples, x, between, u):
                 message = (
                     f"drift, noise and sets repeat after {period:.6g} along axis {axis}, which is not periodic; if it "
                     f"is an angle, write Box(..., periodic=[{axis}]) with a box as wide as its period."

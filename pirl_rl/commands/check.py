@@ -70,14 +70,18 @@ def _problem(named: str, settings: dict[str, Any]) -> ReachAvoidProblem:
         ConfigError: there is no such module or class, or it does not take the arguments.
     """
     module, _, name = named.partition(":")
+    if not module or not name:
+        raise ConfigError(f"expected my_module:MyProblem, got {named!r}")
     try:
-        kind = getattr(importlib.import_module(module), name)
+        # Another error during the import is a bug of the module and is left unchanged.
+        found = importlib.import_module(module)
     except ModuleNotFoundError as error:
         if error.name != module.partition(".")[0] and error.name != module:
             raise
         raise ConfigError(f"{named}: expected a module that Python finds from here, got no module {module!r}") from None
-    except (AttributeError, ValueError):
-        raise ConfigError(f"{named}: expected my_module:MyProblem, but {module} has no class {name!r}") from None
+    if not hasattr(found, name):
+        raise ConfigError(f"{named}: expected my_module:MyProblem, but {module} has no class {name!r}")
+    kind = getattr(found, name)
     if not (isinstance(kind, type) and issubclass(kind, ReachAvoidProblem)):
         raise ConfigError(f"{named}: expected a subclass of pirl_rl.ReachAvoidProblem, got {kind!r}")
     try:
