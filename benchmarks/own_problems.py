@@ -179,7 +179,47 @@ class Slalom(ReachAvoidProblem):
         return (x[..., None, :2] - rocks).norm(dim=-1).amin(-1) - 0.4
 
 
-PROBLEMS = {kind.__name__: kind for kind in (Servo, Steering, Evader, Gusty, TwoTanks, Reservoir, Slalom)}
+class Orbit(ReachAvoidProblem):
+    """Come to rest at a station within an hour, in metres and seconds, before a wall on either side."""
+
+    horizon = 3_600.0
+    states, controls = Box([-1e5, -200.0], [1e5, 200.0]), Box([-0.2], [0.2])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return rows(x[..., 1], u[..., 0])
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return constant(x, [200.0, 0.0], [0.0, 1.0])
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return rows(x[..., 0].abs() - 1e4, x[..., 1].abs() - 30)
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        return 9.5e4 - x[..., :1].abs()
+
+
+class Ring(ReachAvoidProblem):
+    """Drive round a ring road, past a block on its inner lane, into a parking lot; radius and periodic angle."""
+
+    horizon = 3.0
+    states = Box([0.7, -math.pi], [1.8, math.pi], periodic=[1])
+    controls = Box([-1.0, -1.0], [1.0, 1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return rows(u[..., 0] - 0.3 * (x[..., 0] - 1.2), u[..., 1] / x[..., 0].clamp(min=0.5))
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.diag_embed(rows(torch.full_like(x[..., 0], 0.2), 0.2 / x[..., 0].clamp(min=0.5)))
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return rows(math.cos(0.3) - x[..., 1].cos(), (x[..., 0] - 1.25).abs() - 0.2)
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        block = torch.maximum(math.cos(0.25) - (x[..., 1] - 2).cos(), x[..., 0] - 1.3)
+        return torch.minimum(0.45 - (x[..., 0] - 1.25).abs(), block)
+
+
+PROBLEMS = {kind.__name__: kind for kind in (Servo, Steering, Evader, Gusty, TwoTanks, Reservoir, Slalom, Orbit, Ring)}
 
 
 def measured(name: str, seed: int, out: Path, settings: dict) -> Score:

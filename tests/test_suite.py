@@ -51,8 +51,10 @@ def test_the_grid_is_the_truth_where_no_closed_form_is_known(monkeypatch):
     assert ((truth.value >= -1e-6) & (truth.value <= 1 + 1e-6)).all()
 
 
-class HalfSure:
-    """A grid that vouches for the left half of the box alone."""
+class PartlySure:
+    """A grid that vouches for the states with a first coordinate below a bound."""
+
+    bound = 0.0
 
     def __init__(self, problem, points):
         pass
@@ -64,15 +66,25 @@ class HalfSure:
         return x[:, 0]
 
     def error(self, tau, x):
-        return 2 * DOUBT * (x[:, 0] > 0)
+        return 2 * DOUBT * (x[:, 0] > self.bound)
 
 
 def test_states_at_which_the_grid_is_in_doubt_are_replaced(monkeypatch):
-    monkeypatch.setattr("pirl_rl.scoring.truth.GridSolver", HalfSure)
+    """It vouches for about three quarters of the 200 states that are drawn for 100."""
+    monkeypatch.setattr("pirl_rl.scoring.truth.GridSolver", PartlySure)
+    monkeypatch.setattr(PartlySure, "bound", Pendulum.states.high[0] / 2)
     truth = find_truth(Pendulum(), 100, 0)
     assert len(truth.x) == 100
-    assert (truth.x[:, 0] <= 0).double().mean() > 0.85  # half of the 200 drawn ones, give or take a few
+    assert (truth.x[:, 0] <= PartlySure.bound).all()
     assert torch.equal(truth.value, truth.x[:, 0])
+
+
+def test_a_grid_that_is_in_doubt_at_most_states_is_no_truth(monkeypatch):
+    monkeypatch.setattr("pirl_rl.scoring.truth.GridSolver", PartlySure)
+    monkeypatch.setattr(PartlySure, "bound", Pendulum.states.low[0] / 2)
+    truth = find_truth(Pendulum(), 100, 0)
+    assert (truth.source, truth.value) == ("none", None)
+    assert len(truth.x) == 100
 
 
 def test_states_are_reproducible_and_outside_the_sets():

@@ -15,8 +15,8 @@ from pirl_rl.sampling.initial_states import sample_interior
 EARLIEST = 0.1
 """The smallest time to go, as a share of the horizon: below it V is nearly the payoff."""
 
-GRID_POINTS = {1: 401, 2: 241}
-"""Nodes of the grid along each axis, by the number of states. In three states the grid takes too long for a table."""
+GRID_POINTS = {1: 401, 2: 241, 3: 91}
+"""Nodes of the grid along each axis, by the number of states."""
 
 DOUBT = 0.03
 """The grid is no truth at a state for which its estimate of its own error is larger: another state is taken there.
@@ -50,7 +50,7 @@ class Truth:
 def find_truth(problem: ReachAvoidProblem, count: int, seed: int, points: Mapping[int, int] | None = None) -> Truth:
     """The reference values at `count` random states.
 
-    Where they come from a grid, states at which it is in doubt are taken only if too few of the drawn ones are left.
+    States at which a grid is in doubt are left out. If too few of the drawn ones remain, the grid is no truth at all.
 
     Args:
         problem: the physics.
@@ -69,5 +69,7 @@ def find_truth(problem: ReachAvoidProblem, count: int, seed: int, points: Mappin
         return Truth(tau[:count], x[:count], None, "none")
     grid = GridSolver(problem, points[problem.states.dim]).solve()
     error = grid.error(tau, x)
-    kept = (error > DOUBT).long().argsort(stable=True)[:count]
+    kept = (error <= DOUBT).nonzero().flatten()[:count]
+    if len(kept) < count:
+        return Truth(tau[:count], x[:count], None, "none")
     return Truth(tau[kept], x[kept], grid.value(tau[kept], x[kept]), "grid", error[kept].mean().item())
