@@ -11,8 +11,10 @@ from pirl_rl.evaluation import Calibration, Slices, meanings_of
 from pirl_rl.evaluation.planes import coordinate_plane, plane_names, planes_of
 from pirl_rl.evaluation.slices import Section
 from pirl_rl.figures import draw
+from pirl_rl.figures.planes import draw_plane
 from pirl_rl.figures.reliability import draw_reliability
 from pirl_rl.problems import DubinsCar, HalfSpace, Pendulum, Reach1D, ZermeloBoat
+from pirl_rl.sets import Box, Plane
 from pirl_rl.simulator import Simulator
 
 
@@ -89,6 +91,19 @@ def test_a_section_shows_both_sets_and_the_policy():
     figures = draw(evidence)
     assert {*figures} == {"slice_first", "slice_steepest", "policy_first", "policy_steepest"}
     assert len(figures["policy_first"].axes) == 4  # three of six controls, and the scale
+
+
+@pytest.mark.parametrize(("width", "factor"), [(3.0, ""), (3e5, "1e5"), (3e-5, "1e−5")])
+def test_labels_of_very_large_and_very_small_ticks_have_a_common_factor(width, factor):
+    plane = Plane(("a", "b"), Box([-width, -1.0], [width, 1.0]), lambda points: points, lambda x: x)
+    axis, none = torch.linspace(-1, 1, 3), torch.zeros(9, 9, dtype=torch.bool)
+    cut = Section(plane, (width * axis, axis), torch.ones(9), torch.zeros(9, 2), torch.rand(3, 3), none, none)
+    figure = Figure()
+    axes = figure.subplots()
+    draw_plane(axes, cut, cut.value)
+    figure.draw_without_rendering()
+    assert axes.xaxis.get_offset_text().get_text() == factor
+    assert not axes.yaxis.get_offset_text().get_text()
 
 
 def test_bins_of_a_reliability_diagram_hold_equally_many_states():

@@ -12,6 +12,9 @@ from pirl_rl.sets import Box
 
 CONTOURS = (0.1, 0.5, 0.9)
 
+POWERS = (-3, 4)
+"""Labels of ticks below and above these powers of ten have a common factor, since long ones overlap."""
+
 TARGET, AVOID = "limegreen", "red"
 """The colours of the outlines of A and B."""
 
@@ -24,6 +27,7 @@ def draw_plane(axes: Axes, section: Section, values: Tensor) -> QuadMesh:
     axes.clabel(lines, fontsize="x-small")
     draw_sets(axes, section)
     axes.set(xlabel=section.plane.axes[0], ylabel=section.plane.axes[1])
+    axes.ticklabel_format(scilimits=POWERS)
     axes.set(xlim=(first[0], first[-1]), ylim=(second[0], second[-1]))
     return mesh
 
