@@ -26,7 +26,7 @@ COVERS = 0.9
 """The share of a period that a box covers if its coordinate is an angle which may go all the way round."""
 
 PART = 0.38
-"""A share of a period after which what repeats is not the same."""
+"""A shift by this share of its period changes a function that repeats."""
 
 THIN = 2.0
 """Moves in one integration step, in depths of a set, from which paths jump over the set."""

@@ -18,6 +18,12 @@ EARLIEST = 0.1
 GRID_POINTS = {1: 401, 2: 241, 3: 91}
 """Nodes of the grid along each axis, by the number of states."""
 
+LARGEST = 4
+"""The largest number of states and controls together for which the grid is solved.
+
+With three states and two controls it would take half an hour and more than 8 GiB.
+"""
+
 DOUBT = 0.03
 """The grid is no truth at a state for which its estimate of its own error is larger: another state is taken there.
 
@@ -65,7 +71,7 @@ def find_truth(problem: ReachAvoidProblem, count: int, seed: int, points: Mappin
     exact = problem.exact_value(tau[:count], x[:count])
     if exact is not None:
         return Truth(tau[:count], x[:count], exact, "exact")
-    if problem.states.dim not in points:
+    if problem.states.dim not in points or problem.states.dim + problem.controls.dim > LARGEST:
         return Truth(tau[:count], x[:count], None, "none")
     grid = GridSolver(problem, points[problem.states.dim]).solve()
     error = grid.error(tau, x)
