@@ -9,7 +9,8 @@ import torch
 
 import pirl_rl
 import pirl_rl.errors
-from pirl_rl import Box, Plane, ReachAvoidProblem, problems
+from benchmarks.own_problems import Orbit
+from pirl_rl import Box, Plane, problems
 from pirl_rl.checking import examine, report
 from pirl_rl.commands.check import main
 from pirl_rl.problems import DoubleIntegrator, DubinsCar, HalfSpace, Pendulum, Reach1D, ZermeloBoat
@@ -305,26 +306,8 @@ def test_thirty_dimensions_give_no_alarm():
     assert report(examine(HalfSpace(dim=30)), ["error", "warning"]) == ""
 
 
-class Orbit(ReachAvoidProblem):
-    """A double integrator in an hour and 100 km. A move by 2 pi metres changes nothing that shows."""
-
-    horizon = 3600.0
-    states, controls = Box([-1e5, -2e2], [1e5, 2e2]), Box([-0.2], [0.2])
-
-    def drift(self, x, u):
-        return torch.stack([x[..., 1], u[..., 0]], -1)
-
-    def diffusion(self, x, u):
-        return x.new_tensor([[20.0, 0.0], [0.0, 1.0]]).expand(*x.shape, 2)
-
-    def target_constraints(self, x):
-        return torch.stack([x[..., 0].abs() - 5e3, x[..., 1].abs() - 20.0], -1)
-
-    def avoid_level(self, x):
-        return 9.5e4 - x[..., 0].abs()
-
-
 def test_large_units_give_no_alarm():
+    """In 100 km and an hour, a move by 2 pi metres changes nothing that shows, but is no period."""
     assert report(examine(Orbit()), ["error", "warning"]) == ""
 
 

@@ -56,7 +56,8 @@ class Truth:
 def find_truth(problem: ReachAvoidProblem, count: int, seed: int, points: Mapping[int, int] | None = None) -> Truth:
     """The reference values at `count` random states.
 
-    States at which a grid is in doubt are left out. If too few of the drawn ones remain, the grid is no truth at all.
+    The grid is solved for problems with at most `LARGEST` states and controls. States at which it is in doubt are left
+    out. If too few of the drawn ones remain, the grid is no truth at all.
 
     Args:
         problem: the physics.
