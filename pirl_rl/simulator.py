@@ -4,11 +4,8 @@ A control is held for dt. The SDE is integrated by the Euler-Maruyama scheme wit
 How an exit within a sub-step is detected is the rule `crossing`:
 
 - "endpoint": an exit is detected only at the end of a sub-step.
-- "bridge": between the ends of a sub-step the path is a Brownian bridge. It crosses a smooth face g = 0 with the
-  probability exp(-2 g0 g1 / (|sigma^T grad g|^2 h)) of Eq. (bridge), where g0 and g1 are the levels at both ends, and
-  sigma and grad g are taken at the start. This is exact for constant coefficients and a flat face (E. Gobet, Stochastic
-  Processes and their Applications 87, 2000). A face of a target with corners counts only if all other constraints of
-  the target hold at both ends.
+- "bridge": between the ends of a sub-step the path is a Brownian bridge, which may cross faces, see
+  `pirl_rl.crossings`.
 
 A path that both reaches A and enters B within one sub-step counts as a failure. Periodic coordinates are brought back
 into their period at the end of each sub-step, before levels are taken there.
@@ -27,10 +24,18 @@ from torch import Tensor
 
 from pirl_rl.clock import Clock
 from pirl_rl.compilation import Compiled
+from pirl_rl.crossings import crosses_any, enters_intersection
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.sigma import constant_matrix, times, transposed_times
+from pirl_rl.sigma import constant_matrix, times
 from pirl_rl.structure import noise_channels
+
+Draws = tuple[Tensor, Tensor | None, Tensor | None, Tensor | None]
+"""The random numbers of a sub-step: normal (w, N) for the noise, and for crossings uniform (R, N, k) for R attempts at
+the k faces of A, normal (R, 2, N, k) if there are at least two faces, and uniform (N, k') for the k' faces of B."""
+
+ATTEMPTS = 2
+"""How often a path may cross the last face of a target with corners in a sub-step, see `enters_intersection`."""
 
 
 class Step(NamedTuple):
@@ -171,15 +176,19 @@ class Simulator:
             x = self.problem.states.wrap(x + self.problem.drift(x, u) * h)
         return x
 
-    def _draw(self, x: Tensor, rng: torch.Generator | None) -> tuple[Tensor, Tensor | None, Tensor | None]:
-        """The random numbers of a sub-step: normal (w, N), and uniform (N, k) for the faces of A and of B.
+    def _draw(self, x: Tensor, rng: torch.Generator | None) -> Draws:
+        """The random numbers of a sub-step.
 
         They are drawn here, so that `_advance` is a function without side effects, which can be compiled.
         """
         kind = {"generator": rng, "dtype": x.dtype, "device": x.device}
-        normal = torch.randn((self.channels, *x.shape[:-1]), **kind)
-        target, avoid = (torch.rand((*x.shape[:-1], count), **kind) if count else None for count in self._crossings)
-        return normal, target, avoid
+        noise = torch.randn((self.channels, *x.shape[:-1]), **kind)
+        of_target, of_avoid = self._crossings
+        attempts, faces = ATTEMPTS if of_target > 1 else 1, (*x.shape[:-1], of_target)
+        target = torch.rand((attempts, *faces), **kind) if of_target else None
+        avoid = torch.rand((*x.shape[:-1], of_avoid), **kind) if of_avoid else None
+        corners = torch.randn((attempts, 2, *faces), **kind) if of_target > 1 else None
+        return noise, target, corners, avoid
 
     @cached_property
     def _crossings(self) -> tuple[int, int]:
@@ -195,59 +204,20 @@ class Simulator:
         x: Tensor,
         u: Tensor,
         h: Tensor,
-        normal: Tensor,
+        noise: Tensor,
         target: Tensor | None,
+        corners: Tensor | None,
         avoid: Tensor | None,
         constant: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """One sub-step: states (N, n), sigma dW (N, n), and whether paths are in A and in B or crossed a face."""
         problem, sigma = self.problem, self.sigma(x, u, constant)
-        kick = times(sigma, (normal * h.sqrt()).mT)
+        kick = times(sigma, (noise * h.sqrt()).mT)
         moved = problem.states.wrap(x + problem.drift(x, u) * h[..., None] + kick)
         reached, failed = problem.reached(moved), problem.failed(moved)
+        path = (x, moved, sigma, h)
         if target is not None:
-            crossed, others_hold = self._crossed(problem.reached_constraints, x, moved, sigma, h, target)
-            reached = reached | (crossed & others_hold).any(-1)
+            reached = reached | enters_intersection(problem.reached_constraints, *path, target, corners)
         if avoid is not None:
-            crossed, _ = self._crossed(problem.avoid_constraints, x, moved, sigma, h, avoid)
-            failed = failed | crossed.any(-1)
+            failed = failed | crosses_any(problem.avoid_constraints, *path, avoid)
         return moved, kick, reached, failed
-
-    @staticmethod
-    def _crossed(constraints, x, moved, sigma, h, uniform) -> tuple[Tensor, Tensor]:
-        """Whether the bridge crossed each face, and whether all other constraints hold at both ends; (N, k) bool."""
-        probability, before, after = crossing_probability(constraints, x, moved, sigma, h)
-        held = (before <= 0) & (after <= 0)
-        others_hold = held.sum(-1, keepdim=True) - held.long() == before.shape[-1] - 1
-        return uniform < probability, others_hold
-
-
-def crossing_probability(
-    constraints: Callable[[Tensor], Tensor], x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The probability (N, k) that a Brownian bridge crosses each of k faces, Eq. (bridge), and the levels (N, k).
-
-    Args:
-        constraints: the levels of the faces.
-        x, moved: both ends of the bridge (N, n). Where one of them lies inside a face, the probability is 0.
-        sigma: (N, n, w) at x.
-        h: the time between the ends (N,), in s.
-
-    Returns:
-        The probability, and the levels at x and at `moved`.
-    """
-    before, after = constraints(x), constraints(moved)
-    variance = _squared_noise(constraints, x, sigma, before.shape[-1]) * h[..., None]
-    exponent = -2 * before * after / variance
-    # Where the variance is 0, the exponent is NaN or infinite, and the face is not crossed between the ends.
-    probability = torch.where((variance > 0) & (before > 0) & (after > 0), exponent.exp(), torch.zeros_like(before))
-    return probability, before, after
-
-
-def _squared_noise(constraints: Callable[[Tensor], Tensor], x: Tensor, sigma: Tensor, count: int) -> Tensor:
-    """|sigma^T grad g|^2 (N, k) of `count` constraints g at x (N, n), by the fewer of w and k derivatives."""
-    if sigma.shape[-1] <= count:
-        along = [torch.func.jvp(constraints, (x,), (column,))[1] for column in sigma.unbind(-1)]
-        return torch.stack([rate**2 for rate in along]).sum(0)
-    slopes = [torch.func.grad(lambda y, i=i: constraints(y)[..., i].sum())(x) for i in range(count)]
-    return torch.stack([transposed_times(sigma, slope).square().sum(-1) for slope in slopes], -1)

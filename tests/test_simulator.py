@@ -143,9 +143,10 @@ def test_bridge_is_exact_for_an_intersection_whose_other_constraints_hold_at_bot
     assert_agrees(rate, exact, paths)
 
 
-def test_bridge_with_substeps_sees_a_target_with_corners():
+def test_the_bridge_sees_a_target_with_corners():
     """Against steps of 2e-3 checked at their ends, the target grown by 0.5826 sqrt(h), which removes the O(sqrt(h)) of
-    such checks (Broadie, Glasserman and Kou 1997). Near corners the bridge rule misses 0.01 at ten sub-steps."""
+    such checks (Broadie, Glasserman and Kou 1997). With 60,000 paths they give 0.526 +- 0.002. With one step, two and
+    ten the bridge has 0.521, 0.525 and 0.530, all +- 0.002."""
 
     class Grown(Corner):
         def target_constraints(self, x):
@@ -153,10 +154,12 @@ def test_bridge_with_substeps_sees_a_target_with_corners():
 
     paths, start, u = 8_000, [1.0, 0.0], [-0.5, 0.0]
     fine, _ = rates(Simulator(Grown(), 0.1, 50, "endpoint"), start, u, 5, paths)
-    bridge, _ = rates(Simulator(Corner(), 0.1, 10, "bridge"), start, u, 5, paths, seed=1)
-    endpoint, _ = rates(Simulator(Corner(), 0.1, 10, "endpoint"), start, u, 5, paths, seed=2)
+    bridges = [
+        rates(Simulator(Corner(), 0.1, count, "bridge"), start, u, 5, paths, seed=count)[0] for count in (1, 2, 10)
+    ]
+    endpoint, _ = rates(Simulator(Corner(), 0.1, 10, "endpoint"), start, u, 5, paths, seed=1)
     sampling = 3 * math.sqrt(2 * fine * (1 - fine) / paths)
-    assert abs(bridge - fine) <= 0.01 + sampling
+    assert all(abs(bridge - fine) <= 0.003 + sampling for bridge in bridges)
     assert endpoint < fine - 0.01 - sampling
 
 

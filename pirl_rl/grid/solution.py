@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pirl_rl.crossings import crossing_probability
 from pirl_rl.errors import ArgumentError, CheckpointError
 from pirl_rl.files import replacing
 from pirl_rl.grid.mesh import Mesh, absorbed
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.simulator import crossing_probability
 
 ROUNDING = 1e-4
 """The share of the horizon by which tau may exceed it, because tau may be rounded to float32."""

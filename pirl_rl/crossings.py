@@ -1,0 +1,142 @@
+"""Crossings of faces between both ends of an integration step, where the path is a Brownian bridge.
+
+A bridge crosses a smooth face g = 0 with the probability exp(-2 g0 g1 / (|sigma^T grad g|^2 h)) of Eq. (bridge), where
+g0 and g1 are the levels at both ends, and sigma and grad g are taken at the start. This is exact for constant
+coefficients and a flat face (E. Gobet, Stochastic Processes and their Applications 87, 2000).
+
+A path enters an intersection of several sets, such as a box, at the time at which it crosses the last face, if no other
+level is positive then, see `enters_intersection`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from pirl_rl.sigma import transposed_times
+
+Constraints = Callable[[Tensor], Tensor]
+"""Maps states (N, n) to the levels (N, k) of k faces."""
+
+SMALLEST = 1e-12
+"""The smallest product of both levels of a bridge, in units of its variance, with which a time of crossing is drawn."""
+
+
+def crossing_probability(
+    constraints: Constraints, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The probability (N, k) that a Brownian bridge crosses each of k faces, Eq. (bridge), and the levels (N, k).
+
+    Args:
+        constraints: the levels of the faces.
+        x, moved: both ends of the bridge (N, n). Where one of them lies inside a face, the probability is 0.
+        sigma: (N, n, w) at x.
+        h: the time between the ends (N,), in s.
+
+    Returns:
+        The probability, and the levels at x and at `moved`.
+    """
+    before, after, variance = _bridge(constraints, x, moved, sigma, h)
+    return _probability(before, after, variance), before, after
+
+
+def crosses_any(
+    constraints: Constraints, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor, uniform: Tensor
+) -> Tensor:
+    """Whether bridges with both ends outside cross one of k faces, (N,) bool.
+
+    The faces are drawn independently of each other.
+
+    Args:
+        constraints, x, moved, sigma, h: those of `crossing_probability`.
+        uniform: uniform random numbers (N, k).
+    """
+    return (uniform < crossing_probability(constraints, x, moved, sigma, h)[0]).any(-1)
+
+
+def enters_intersection(
+    constraints: Constraints,
+    x: Tensor,
+    moved: Tensor,
+    sigma: Tensor,
+    h: Tensor,
+    uniform: Tensor,
+    normal: Tensor | None,
+) -> Tensor:
+    """Whether bridges from outside enter the set in which all k constraints hold, (N,) bool.
+
+    To enter it, a path must cross every face outside of which it is. The times at which it crosses each of them for the
+    first time are drawn from their law. At the last of these times the levels of all other faces are drawn: those of
+    faces that were crossed start at 0 at their own time of crossing, and those of the others where they were. If none
+    of them is positive, the path has entered. Else the rest of the step is drawn in the same way. A path that has not
+    entered after R attempts is outside. The noise of different faces is taken as independent.
+
+    Args:
+        constraints, x, moved, sigma, h: those of `crossing_probability`.
+        uniform: uniform random numbers (R, N, k).
+        normal: standard normal numbers (R, 2, N, k); with one constraint and one attempt they are not needed.
+    """
+    level, after, variance = _bridge(constraints, x, moved, sigma, h)
+    if normal is None:
+        return (uniform[0] < _chance(level, after, variance)).all(-1)
+    least = torch.finfo(x.dtype).tiny
+    entered, under_way = (
+        torch.zeros_like(level[..., 0], dtype=torch.bool),
+        torch.ones_like(level[..., 0], dtype=torch.bool),
+    )
+    for probability, (order, noise) in zip(uniform.unbind(), normal.unbind(), strict=True):
+        outside, chance = level > 0, _chance(level, after, variance)
+        under_way = under_way & (probability < chance).all(-1)
+        first = _crossing_time(level, after, variance, probability / chance.clamp(min=least), order)
+        start, level = torch.where(outside, first, 0.0), torch.where(outside, 0.0, level)
+        last = start.amax(-1, keepdim=True)
+        share = (last - start) / (1 - start).clamp(min=torch.finfo(x.dtype).eps)
+        spread = (share * (1 - last) * variance).clamp(min=0).sqrt()
+        # The share of the face that was crossed last is 0, so that its level is exactly 0.
+        level, variance = level + share * (after - level) + spread * noise, variance * (1 - last)
+        entered = entered | (under_way & (level <= 0).all(-1))
+    return entered
+
+
+def _chance(before: Tensor, after: Tensor, variance: Tensor) -> Tensor:
+    """The probability (N, k) that a bridge is inside of a face at some time, 1 where it is inside at one end."""
+    return torch.where((before > 0) & (after > 0), _probability(before, after, variance), torch.ones_like(after))
+
+
+def _crossing_time(before: Tensor, after: Tensor, variance: Tensor, uniform: Tensor, normal: Tensor) -> Tensor:
+    """The time (N, k), as a share of the step, at which bridges that cross their face do so for the first time.
+
+    By reflection only |after| matters. With a = before, b = |after| and the variance v over the step, s / (1 - s) has
+    the inverse Gaussian distribution with the mean a / b and the shape a^2 / v. It is drawn by the method of J.
+    Michael, W. Schucany and R. Haas (The American Statistician 30, 1976). Without noise s is a / (a + b).
+    """
+    a, b = before.abs(), after.abs()
+    product = torch.maximum(a * b, SMALLEST * variance).clamp(min=torch.finfo(a.dtype).tiny)
+    z = variance * normal.square() / (2 * product)
+    root = 1 + z + (z * (z + 2)).sqrt()
+    b = torch.where(uniform * (1 + root) <= root, b * root, b / root)
+    return a / (a + b).clamp(min=torch.finfo(a.dtype).tiny)
+
+
+def _bridge(constraints: Constraints, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor) -> tuple[Tensor, ...]:
+    """The levels (N, k) at both ends, and the variance (N, k) of the levels over the time h (N,)."""
+    before, after = constraints(x), constraints(moved)
+    return before, after, _squared_noise(constraints, x, sigma, before.shape[-1]) * h[..., None]
+
+
+def _probability(before: Tensor, after: Tensor, variance: Tensor) -> Tensor:
+    """Eq. (bridge) where both ends are outside, else 0; all arguments are (N, k)."""
+    # Where the variance is 0, the exponent is NaN or infinite, and the face is not crossed between the ends.
+    between = (variance > 0) & (before > 0) & (after > 0)
+    return torch.where(between, (-2 * before * after / variance).exp(), torch.zeros_like(before))
+
+
+def _squared_noise(constraints: Constraints, x: Tensor, sigma: Tensor, count: int) -> Tensor:
+    """|sigma^T grad g|^2 (N, k) of `count` constraints g at x (N, n), by the fewer of w and k derivatives."""
+    if sigma.shape[-1] <= count:
+        along = [torch.func.jvp(constraints, (x,), (column,))[1] for column in sigma.unbind(-1)]
+        return torch.stack([rate**2 for rate in along]).sum(0)
+    slopes = [torch.func.grad(lambda y, i=i: constraints(y)[..., i].sum())(x) for i in range(count)]
+    return torch.stack([transposed_times(sigma, slope).square().sum(-1) for slope in slopes], -1)
