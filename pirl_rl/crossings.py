@@ -81,22 +81,20 @@ def enters_intersection(
     level, after, variance = _bridge(constraints, x, moved, sigma, h)
     if normal is None:
         return (uniform[0] < _chance(level, after, variance)).all(-1)
-    least = torch.finfo(x.dtype).tiny
-    entered, under_way = (
-        torch.zeros_like(level[..., 0], dtype=torch.bool),
-        torch.ones_like(level[..., 0], dtype=torch.bool),
-    )
-    for probability, (order, noise) in zip(uniform.unbind(), normal.unbind(), strict=True):
+    entered = torch.zeros_like(level[..., 0], dtype=torch.bool)
+    may_enter, limits = ~entered, torch.finfo(x.dtype)
+    for drawn, (timing, noise) in zip(uniform.unbind(), normal.unbind(), strict=True):
         outside, chance = level > 0, _chance(level, after, variance)
-        under_way = under_way & (probability < chance).all(-1)
-        first = _crossing_time(level, after, variance, probability / chance.clamp(min=least), order)
+        may_enter = may_enter & (drawn < chance).all(-1)
+        # Where a draw is below the chance, their ratio is uniform again.
+        first = _crossing_time(level, after, variance, drawn / chance.clamp(min=limits.tiny), timing)
         start, level = torch.where(outside, first, 0.0), torch.where(outside, 0.0, level)
         last = start.amax(-1, keepdim=True)
-        share = (last - start) / (1 - start).clamp(min=torch.finfo(x.dtype).eps)
+        share = (last - start) / (1 - start).clamp(min=limits.eps)
         spread = (share * (1 - last) * variance).clamp(min=0).sqrt()
         # The share of the face that was crossed last is 0, so that its level is exactly 0.
         level, variance = level + share * (after - level) + spread * noise, variance * (1 - last)
-        entered = entered | (under_way & (level <= 0).all(-1))
+        entered = entered | (may_enter & (level <= 0).all(-1))
     return entered
 
 
