@@ -104,7 +104,7 @@ def _chance(before: Tensor, after: Tensor, variance: Tensor) -> Tensor:
 
 
 def _crossing_time(before: Tensor, after: Tensor, variance: Tensor, uniform: Tensor, normal: Tensor) -> Tensor:
-    """The time (N, k), as a share of the step, at which bridges that cross their face do so for the first time.
+    """The time (N, k), as a share of the step, at which bridges first cross their face, Eq. (crossing_time).
 
     By reflection only |after| matters. With a = before, b = |after| and the variance v over the step, s / (1 - s) has
     the inverse Gaussian distribution with the mean a / b and the shape a^2 / v. It is drawn by the method of J.
