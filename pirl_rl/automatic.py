@@ -20,6 +20,9 @@ Keys that take it: env.dt, env.substeps, trainer.updates, loss.hjb_probes and th
 UPDATES_PER_DIMENSION, FEW_STATES, UPDATES_OF_MANY = 2_300, 3, 2_900
 """The number of updates for each dimension of (tau, x): the first up to `FEW_STATES` states, and the last beyond."""
 
+MOST_OF_FEW = 8_000
+"""The largest number of updates up to `FEW_STATES` states. They take three minutes on two cores."""
+
 BASE_COST, MOST_COST = 80, 1_700_000
 """The time of an update is about proportional to BASE_COST + n for n states, as measured at 6 and at 100 states.
 
@@ -73,8 +76,10 @@ def choose_updates(config: DictConfig, problem: ReachAvoidProblem) -> None:
     """Replace `auto` in trainer.updates by a number, which grows with the dimensions of V(tau, x) up to a limit."""
     if config.trainer.get("updates") == AUTO:
         n = problem.states.dim
-        each = UPDATES_PER_DIMENSION if n <= FEW_STATES else UPDATES_OF_MANY
-        config.trainer.updates = min(each * (n + 1), max(1, MOST_COST // (BASE_COST + n)))
+        if n <= FEW_STATES:
+            config.trainer.updates = min(UPDATES_PER_DIMENSION * (n + 1), MOST_OF_FEW)
+        else:
+            config.trainer.updates = min(UPDATES_OF_MANY * (n + 1), max(1, MOST_COST // (BASE_COST + n)))
 
 
 def choose_paths(config: DictConfig, problem: ReachAvoidProblem, simulator: Simulator) -> None:

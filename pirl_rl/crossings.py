@@ -4,6 +4,9 @@ A bridge crosses a smooth face g = 0 with the probability exp(-2 g0 g1 / (|sigma
 g0 and g1 are the levels at both ends, and sigma and grad g are taken at the start. This is exact for constant
 coefficients and a flat face (E. Gobet, Stochastic Processes and their Applications 87, 2000).
 
+Without the ends, the probability that a path crosses a face within a time is that of Brownian motion with drift, see
+`first_passage`.
+
 A path enters an intersection of several sets, such as a box, at the time at which it crosses the last face, if no other
 level is positive then, see `enters_intersection`.
 """
@@ -24,22 +27,48 @@ SMALLEST = 1e-12
 """The smallest product of both levels of a bridge, in units of its variance, with which a time of crossing is drawn."""
 
 
-def crossing_probability(
-    constraints: Constraints, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The probability (N, k) that a Brownian bridge crosses each of k faces, Eq. (bridge), and the levels (N, k).
+def first_passage(tau: Tensor, distance: Tensor, drift: Tensor | float = 1.0, sigma: Tensor | float = 1.0) -> Tensor:
+    """The probability (*) that drift * t + sigma W_t comes to a level at `distance` within tau.
+
+    It is Phi((m tau - d)/(s sqrt(tau))) + exp(2 m d/s^2) Phi(-(m tau + d)/(s sqrt(tau))) with the distance d, the drift
+    m and the strength s of the noise (Karatzas and Shreve, Brownian Motion and Stochastic Calculus, Sec. 3.5.C). The
+    factors of the second term may overflow or underflow. Their product is therefore computed with erfcx, except where
+    the drift leads so fast away from the level that exp(2 m d/s^2) is the small one.
+
+    Args:
+        tau: times (*), in s.
+        distance: distances (*) to the level; the level counts as reached where they are not positive.
+        drift: the drift (*) towards the level, in units of the distance per s.
+        sigma: the strength (*) of the noise, above 0, in units of the distance per sqrt(s).
+    """
+    outside = (distance > 0) & (tau > 0)
+    # Absorbed states and tau = 0 get other arguments, so that no NaN enters the gradient through torch.where.
+    d_safe = torch.where(outside, distance, torch.ones_like(distance))
+    tau_safe = torch.where(outside, tau, torch.ones_like(tau))
+    scale = torch.sqrt(2 * tau_safe) * sigma
+    early, late = (d_safe - drift * tau_safe) / scale, (d_safe + drift * tau_safe) / scale
+    towards = torch.exp(-(early**2)) * torch.special.erfcx(late.clamp(min=0))
+    away = torch.exp((2 * (drift / sigma) * (d_safe / sigma)).clamp(max=0)) * torch.special.erfc(late)
+    value = (torch.special.erfc(early) + torch.where(late > 0, towards, away)) / 2
+    return torch.where(outside, value, (distance <= 0).to(value.dtype))
+
+
+def passage_probability(constraints: Constraints, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor) -> Tensor:
+    """The probability (N, k) that paths cross each of k faces within the time h, wherever they are then.
+
+    Each level is taken as Brownian motion with drift, see `first_passage`.
 
     Args:
         constraints: the levels of the faces.
-        x, moved: both ends of the bridge (N, n). Where one of them lies inside a face, the probability is 0.
+        x: where the paths start (N, n). The probability is 1 for faces inside of which that is.
+        moved: where they are after h without noise (N, n).
         sigma: (N, n, w) at x.
-        h: the time between the ends (N,), in s.
-
-    Returns:
-        The probability, and the levels at x and at `moved`.
+        h: the time (N,), in s.
     """
-    before, after, variance = _bridge(constraints, x, moved, sigma, h)
-    return _probability(before, after, variance), before, after
+    level, after, variance = _bridge(constraints, x, moved, sigma, h)
+    # In units of h, the drift is the way of the level, and the strength of the noise is its deviation after h.
+    deviation = variance.sqrt().clamp(min=torch.finfo(x.dtype).tiny ** 0.5)
+    return first_passage(torch.ones_like(level), level, level - after, deviation)
 
 
 def crosses_any(
@@ -50,10 +79,13 @@ def crosses_any(
     The faces are drawn independently of each other.
 
     Args:
-        constraints, x, moved, sigma, h: those of `crossing_probability`.
+        constraints: the levels of the faces.
+        x, moved: both ends of the bridges (N, n).
+        sigma: (N, n, w) at x.
+        h: the time between the ends (N,), in s.
         uniform: uniform random numbers (N, k).
     """
-    return (uniform < crossing_probability(constraints, x, moved, sigma, h)[0]).any(-1)
+    return (uniform < _probability(*_bridge(constraints, x, moved, sigma, h))).any(-1)
 
 
 def enters_intersection(
@@ -74,7 +106,7 @@ def enters_intersection(
     entered after R attempts is outside. The noise of different faces is taken as independent.
 
     Args:
-        constraints, x, moved, sigma, h: those of `crossing_probability`.
+        constraints, x, moved, sigma, h: those of `crosses_any`.
         uniform: uniform random numbers (R, N, k).
         normal: standard normal numbers (R, 2, N, k); with one constraint and one attempt they are not needed.
     """

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pirl_rl.crossings import crosses_any, enters_intersection
+from pirl_rl.crossings import _crossing_time, crosses_any, enters_intersection, first_passage, passage_probability
 
 DEVIATION = 0.7
 PATHS = 200_000
@@ -106,7 +106,7 @@ def test_faces_of_many_constraints_need_no_product_of_them():
 
 
 def test_extreme_levels_give_no_nan():
-    """Levels from 1e-30 to 1e6 with noise of any size enter or not, as their ends say, in single precision."""
+    """Levels from 1e-30 to 1e6 with noise of any size enter or not, as their ends say, where noise is far smaller."""
     scales = torch.tensor([1e-30, 1e-12, 1e-3, 1.0, 1e6])
     a, b, s = (
         entry.flatten() for entry in torch.meshgrid(scales, scales, torch.tensor([0.0, 1e-6, 1.0, 1e4]), indexing="ij")
@@ -115,12 +115,50 @@ def test_extreme_levels_give_no_nan():
     sigma, h, rng = s[:, None, None].expand(-1, 2, 1), torch.ones_like(a), torch.Generator().manual_seed(0)
     uniform, normal = torch.rand(2, *x.shape, generator=rng), torch.randn(2, 2, *x.shape, generator=rng)
     entered = enters_intersection(lambda y: y, x, moved, sigma, h, uniform, normal)
-    assert entered[s == 0].all()
+    sure = s <= 1e-3 * torch.minimum(a, b)
+    assert sure.sum() > (s == 0).sum()
+    assert entered[sure].all()
     back: Tensor = enters_intersection(lambda y: y, x, -moved, sigma, h, uniform, normal)
-    assert not back[s == 0].any()
+    assert not back[sure].any()
+    # A NaN would read as "not entered" where the noise decides, so that the times themselves are looked at.
+    time = _crossing_time(x, moved, (s**2)[:, None].expand_as(x), uniform[0], normal[0, 0])
+    assert ((time >= 0) & (time <= 1)).all()
 
 
 def test_any_face_is_enough_for_a_union():
     x, moved = torch.tensor([[0.5, 9.0], [9.0, 9.0]]), torch.tensor([[1e-9, 9.0], [9.0, 9.0]])
     sigma, uniform = torch.ones(2, 2, 1), torch.full((2, 2), 0.5)
     assert crosses_any(lambda y: y, x, moved, sigma, torch.ones(2), uniform).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("drift", [-3.0, -0.5, 0.0, 0.5, 3.0])
+def test_first_passage_is_the_integral_of_its_density(drift):
+    """The density is d / (s sqrt(2 pi t^3)) exp(-(d - m t)^2 / (2 s^2 t)); the integral is over log t."""
+    d, s, tau = 0.7, 0.6, 1.5
+    log_t = torch.linspace(-12, math.log(tau), 40_001, dtype=torch.float64)
+    t = log_t.exp()
+    density = d / (s * (2 * math.pi * t**3).sqrt()) * (-((d - drift * t) ** 2) / (2 * s**2 * t)).exp()
+    expected = torch.trapezoid(density * t, log_t)
+    time, distance = (torch.tensor([number], dtype=torch.float64) for number in (tau, d))
+    assert first_passage(time, distance, drift, s).item() == pytest.approx(expected.item(), abs=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_first_passage_is_a_probability_at_extreme_arguments(dtype):
+    scales = torch.tensor([0.0, 1e-30, 1e-3, 1.0, 1e6], dtype=dtype)
+    drifts = torch.cat([-scales, scales])
+    tau, d, m, s = torch.meshgrid(scales, scales, drifts, scales[1:], indexing="ij")
+    p = first_passage(tau, d, m, s)
+    assert ((p >= 0) & (p <= 1 + torch.finfo(dtype).eps)).all()
+    assert torch.equal(p[tau == 0], (d[tau == 0] <= 0).to(dtype))
+
+
+def test_a_path_leaves_a_wall_with_its_exact_probability():
+    """With drift v away from a face at the distance a, 1 - exp(-2 a v / sigma^2) of the paths never cross it."""
+    a, v, s, h = torch.tensor([0.01, 0.1, 0.3], dtype=torch.float64), 1.0, 0.5, 50.0
+    x, moved = a[:, None], a[:, None] + v * h
+    sigma, time = torch.full((3, 1, 1), s, dtype=torch.float64), torch.full((3,), h, dtype=torch.float64)
+    crossed = passage_probability(lambda y: y, x, moved, sigma, time)
+    torch.testing.assert_close(crossed[:, 0], (-2 * a * v / s**2).exp(), rtol=0, atol=1e-6)
+    still = passage_probability(lambda y: y, x, x, sigma * 0, time)
+    assert (still == 0).all()

@@ -232,7 +232,7 @@ def test_a_number_beside_auto_is_kept(capsys):
     [
         ("reach1d", 4_600),
         ("zermelo", 6_900),
-        ("dubins", 9_200),
+        ("dubins", 8_000),
         ("cartpole", 14_500),
         ("quadrotor", 19_767),
         ("halfspace", 9_444),

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pirl_rl.crossings import crossing_probability
+from pirl_rl.crossings import passage_probability
 from pirl_rl.errors import ArgumentError, CheckpointError
 from pirl_rl.files import replacing
 from pirl_rl.grid.mesh import Mesh, absorbed
@@ -21,7 +21,7 @@ ROUNDING = 1e-4
 
 
 POINTS_OF_A_CELL = 8
-"""The number of points of a path through one cell, between which the noise may cross a face."""
+"""The number of steps in which a path goes through one cell."""
 
 
 class GridSolution:
@@ -219,28 +219,28 @@ class GridSolution:
     def _after_a_cell(self, tau: Tensor, x: Tensor) -> Tensor:
         """V (P,) at states outside A and B, from that where the flow is one cell further.
 
-        On the way the noise may cross a face, with the probability of Eq. (bridge) between any two of the points
-        through which the flow goes.
+        On the way the noise may cross a face. Its level is taken as Brownian motion with the drift of the whole way,
+        see `pirl_rl.crossings.passage_probability`. Paths that cross a face of A and one of B count as failures.
         """
         problem, sets = self.problem, []
-        if problem.objective == "reach-avoid":
-            sets.append((problem.reached_constraints, True))
         if problem.has_avoid_set:
             sets.append((problem.avoid_constraints, False))
-        rate = problem.drift(x, self.policy(tau, x)).abs() / torch.as_tensor(self.mesh.spacing).to(x)
-        h = torch.minimum(tau, 1 / rate.amax(-1).clamp(min=1e-12)) / POINTS_OF_A_CELL
-        under_way, value = torch.ones_like(tau), torch.zeros_like(tau)
+        if problem.objective == "reach-avoid":
+            sets.append((problem.reached_constraints, True))
+        u = self.policy(tau, x)
+        rate = problem.drift(x, u).abs() / torch.as_tensor(self.mesh.spacing).to(x)
+        length = torch.minimum(tau, 1 / rate.amax(-1).clamp(min=1e-12))
+        moved, left, h = x, tau, length / POINTS_OF_A_CELL
         for _ in range(POINTS_OF_A_CELL):
-            u = self.policy(tau, x)
-            moved, sigma = problem.states.wrap(x + problem.drift(x, u) * h.unsqueeze(-1)), problem.diffusion(x, u)
-            for constraints, reached in sets:
-                crossed, before, after = crossing_probability(constraints, x, moved, sigma, h)
-                crossed = torch.where((before <= 0) | (after <= 0), torch.ones_like(crossed), crossed)
-                # All constraints of A must hold, and one of B suffices.
-                ended = under_way * (crossed.amin(-1) if reached else 1 - (1 - crossed).prod(-1))
-                under_way, value = under_way - ended, value + (ended if reached else 0)
-            tau, x = (tau - h).clamp(min=0), moved
-        return value + under_way * self._interpolated(tau, x)
+            moved = problem.states.wrap(moved + problem.drift(moved, self.policy(left, moved)) * h.unsqueeze(-1))
+            left = (left - h).clamp(min=0)
+        under_way, value = torch.ones_like(tau), torch.zeros_like(tau)
+        for constraints, reached in sets:
+            crossed = passage_probability(constraints, x, moved, problem.diffusion(x, u), length)
+            # All constraints of A must hold, and one of B suffices.
+            ended = under_way * (crossed.amin(-1) if reached else 1 - (1 - crossed).prod(-1))
+            under_way, value = under_way - ended, value + (ended if reached else 0)
+        return value + under_way * self._interpolated(left, moved)
 
     def _uncut(self, x: Tensor) -> Tensor:
         """Whether all corners of the cells around states (P, n) lie outside A and B, (P,) bool."""

@@ -11,10 +11,10 @@ import math
 import torch
 from torch import Tensor
 
+from pirl_rl.crossings import first_passage
 from pirl_rl.errors import ArgumentError
 from pirl_rl.payoffs import Payoff
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.problems.first_passage import first_passage
 from pirl_rl.sets import Box, Plane
 
 
