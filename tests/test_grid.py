@@ -304,10 +304,14 @@ def test_the_dubins_car_agrees_with_monte_carlo_of_its_own_policy():
 
 
 def test_v_rises_from_a_wall_that_paths_leave():
-    """Next to a wall V changes within a layer that is far thinner than a cell."""
+    """Next to a wall V changes within a layer that is far thinner than a cell, as 1 - exp(-2 v d/sigma^2) at d."""
     problem = DubinsCar()
     solution = GridSolver(problem, points=41, estimate=False).solve()
-    away = torch.tensor([[-1.99, 0.0, 0.0], [-1.95, 0.0, 0.0], [-1.9, 0.0, 0.0]], dtype=torch.float64)
-    tau = torch.full((3,), 4.0, dtype=torch.float64)
+    distance = torch.tensor([0.0034, 0.01, 0.05, 0.1], dtype=torch.float64)
+    away = torch.stack([distance - problem.wall, 0 * distance, 0 * distance], -1)
+    tau = torch.full((4,), 4.0, dtype=torch.float64)
+    value = solution.value(tau, away)
     played = monte_carlo(problem, solution.policy, tau, away, rollouts=2_000, dt=0.01)
-    assert (solution.value(tau, away) - played.probability).abs().max() < 0.1
+    assert (value - played.probability).abs().max() < 0.1
+    layer = 1 - (-2 * problem.speed * distance / problem.noise[0] ** 2).exp()
+    assert (value / value[-1] - layer)[:2].abs().max() < 0.01
