@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -52,8 +51,8 @@ def _draw_times(panel: Axes, scores: Mapping[str, Sequence[Mapping[str, float]]]
     families: dict[str, dict[int, float]] = {}
     for name, runs in scores.items():
         if found := FAMILY.fullmatch(name):
-            mean = float(np.mean([run["seconds"] for run in runs]))
-            families.setdefault(found[1], {})[int(found[2])] = mean
+            # Other processes on the machine only lengthen a time.
+            families.setdefault(found[1], {})[int(found[2])] = min(run["seconds"] for run in runs)
     for family, times in families.items():
         panel.plot(sorted(times), [times[n] for n in sorted(times)], "o-", label=family)
     if families:
@@ -63,5 +62,5 @@ def _draw_times(panel: Axes, scores: Mapping[str, Sequence[Mapping[str, float]]]
         panel.minorticks_off()
         panel.set_ylim(bottom=0)
         panel.legend()
-    panel.set(xlabel="number of states n", ylabel="time of training (s)")
+    panel.set(xlabel="number of states n", ylabel="time of training, fastest seed (s)")
     panel.grid(alpha=0.3)
