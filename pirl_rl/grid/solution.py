@@ -20,7 +20,7 @@ ROUNDING = 1e-4
 """The share of the horizon by which tau may exceed it, because tau may be rounded to float32."""
 
 
-POINTS_OF_A_CELL = 8
+STEPS_OF_A_CELL = 8
 """The number of steps in which a path goes through one cell."""
 
 
@@ -230,13 +230,13 @@ class GridSolution:
         u = self.policy(tau, x)
         rate = problem.drift(x, u).abs() / torch.as_tensor(self.mesh.spacing).to(x)
         length = torch.minimum(tau, 1 / rate.amax(-1).clamp(min=1e-12))
-        moved, left, h = x, tau, length / POINTS_OF_A_CELL
-        for _ in range(POINTS_OF_A_CELL):
+        moved, left, h = x, tau, length / STEPS_OF_A_CELL
+        for _ in range(STEPS_OF_A_CELL):
             moved = problem.states.wrap(moved + problem.drift(moved, self.policy(left, moved)) * h.unsqueeze(-1))
             left = (left - h).clamp(min=0)
-        under_way, value = torch.ones_like(tau), torch.zeros_like(tau)
+        sigma, under_way, value = problem.diffusion(x, u), torch.ones_like(tau), torch.zeros_like(tau)
         for constraints, reached in sets:
-            crossed = passage_probability(constraints, x, moved, problem.diffusion(x, u), length)
+            crossed = passage_probability(constraints, x, moved, sigma, length)
             # All constraints of A must hold, and one of B suffices.
             ended = under_way * (crossed.amin(-1) if reached else 1 - (1 - crossed).prod(-1))
             under_way, value = under_way - ended, value + (ended if reached else 0)
