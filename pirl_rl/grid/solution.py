@@ -10,18 +10,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pirl_rl.crossings import passage_probability
 from pirl_rl.errors import ArgumentError, CheckpointError
 from pirl_rl.files import replacing
 from pirl_rl.grid.mesh import Mesh, absorbed
+from pirl_rl.grid.transport import after_a_cell
 from pirl_rl.problem import ReachAvoidProblem
 
 ROUNDING = 1e-4
 """The share of the horizon by which tau may exceed it, because tau may be rounded to float32."""
-
-
-STEPS_OF_A_CELL = 8
-"""The number of steps in which a path goes through one cell."""
 
 
 class GridSolution:
@@ -41,7 +37,7 @@ class GridSolution:
         coarse: the solution with half as many points and steps, or None, and then the error is not known.
         split: whether drift and noise acted in turns, see `pirl_rl.grid.transport`. V is then not extrapolated from
             `coarse`, since its order is not known. In cells that a face cuts it is that at the end of a short path, see
-            `_after_a_cell`: where the noise is weak, V rises from the face within a layer that is thinner than a cell.
+            `after_a_cell`: where the noise is weak, V rises from the face within a layer that is thinner than a cell.
     """
 
     def __init__(
@@ -203,7 +199,8 @@ class GridSolution:
         fine = self._interpolated(tau, x)
         if self.split:
             cut = ~self._uncut(x) & self.problem.interior(x)
-            fine[cut] = self._after_a_cell(tau[cut], x[cut])
+            spacing = torch.as_tensor(self.mesh.spacing).to(x)
+            fine[cut] = after_a_cell(self.problem, spacing, self.policy, self._interpolated, tau[cut], x[cut])
             return fine
         if self.coarse is None:
             return fine
@@ -215,32 +212,6 @@ class GridSolution:
         for time, node, weight in self._corners(tau, x):
             result += weight * self._values[time, node]
         return torch.from_numpy(result).to(x)
-
-    def _after_a_cell(self, tau: Tensor, x: Tensor) -> Tensor:
-        """V (P,) at states outside A and B, from that where the flow is one cell further.
-
-        On the way the noise may cross a face. Its level is taken as Brownian motion with the drift of the whole way,
-        see `pirl_rl.crossings.passage_probability`. Paths that cross a face of A and one of B count as failures.
-        """
-        problem, sets = self.problem, []
-        if problem.has_avoid_set:
-            sets.append((problem.avoid_constraints, False))
-        if problem.objective == "reach-avoid":
-            sets.append((problem.reached_constraints, True))
-        u = self.policy(tau, x)
-        rate = problem.drift(x, u).abs() / torch.as_tensor(self.mesh.spacing).to(x)
-        length = torch.minimum(tau, 1 / rate.amax(-1).clamp(min=1e-12))
-        moved, left, h = x, tau, length / STEPS_OF_A_CELL
-        for _ in range(STEPS_OF_A_CELL):
-            moved = problem.states.wrap(moved + problem.drift(moved, self.policy(left, moved)) * h.unsqueeze(-1))
-            left = (left - h).clamp(min=0)
-        sigma, under_way, value = problem.diffusion(x, u), torch.ones_like(tau), torch.zeros_like(tau)
-        for constraints, reached in sets:
-            crossed = passage_probability(constraints, x, moved, sigma, length)
-            # All constraints of A must hold, and one of B suffices.
-            ended = under_way * (crossed.amin(-1) if reached else 1 - (1 - crossed).prod(-1))
-            under_way, value = under_way - ended, value + (ended if reached else 0)
-        return value + under_way * self._interpolated(left, moved)
 
     def _uncut(self, x: Tensor) -> Tensor:
         """Whether all corners of the cells around states (P, n) lie outside A and B, (P,) bool."""

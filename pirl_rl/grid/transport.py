@@ -14,12 +14,15 @@ by the chain without drift. Between nodes V is a cubic spline that is limited to
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
 
 import numpy as np
 import torch
 from scipy.ndimage import map_coordinates, spline_filter
+from torch import Tensor
 
+from pirl_rl.crossings import passage_probability
 from pirl_rl.grid.mesh import Mesh, absorbed
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.structure import has_controlled_noise
@@ -35,6 +38,9 @@ PADDING = 8
 
 LOOKS = 2
 """The number of looks for A and B on a path through one cell."""
+
+STEPS_OF_A_CELL = 8
+"""The number of steps in which `after_a_cell` follows a path."""
 
 GAIN = 1e-9
 """The gain of V by which a candidate must exceed those before it."""
@@ -94,6 +100,48 @@ class Transport:
             width[axis] = (PADDING, PADDING)
             field = np.pad(field, width, mode="wrap" if axis in self._mesh.periodic else "edge")
         return field
+
+
+def after_a_cell(
+    problem: ReachAvoidProblem,
+    spacing: Tensor,
+    policy: Callable[[Tensor, Tensor], Tensor],
+    value: Callable[[Tensor, Tensor], Tensor],
+    tau: Tensor,
+    x: Tensor,
+) -> Tensor:
+    """V (P,) at states outside A and B, from that where the flow is one cell further.
+
+    On the way the noise may cross a face. Its level is taken as Brownian motion with the drift of the whole way, see
+    `pirl_rl.crossings.passage_probability`. Paths that cross a face of A and one of B count as failures.
+
+    Args:
+        problem: the physics.
+        spacing: the distances (n,) of the nodes, in SI units.
+        policy: gives the controls, in SI units, at tau and x.
+        value: gives V between the nodes, continued into A and B, at tau and x.
+        tau: times to go (P,), in s.
+        x: states (P, n), in SI units.
+    """
+    sets = []
+    if problem.has_avoid_set:
+        sets.append((problem.avoid_constraints, False))
+    if problem.objective == "reach-avoid":
+        sets.append((problem.reached_constraints, True))
+    u = policy(tau, x)
+    rate = problem.drift(x, u).abs() / spacing
+    length = torch.minimum(tau, 1 / rate.amax(-1).clamp(min=1e-12))
+    moved, left, h = x, tau, length / STEPS_OF_A_CELL
+    for _ in range(STEPS_OF_A_CELL):
+        moved = problem.states.wrap(moved + problem.drift(moved, policy(left, moved)) * h.unsqueeze(-1))
+        left = (left - h).clamp(min=0)
+    sigma, under_way, result = problem.diffusion(x, u), torch.ones_like(tau), torch.zeros_like(tau)
+    for constraints, reached in sets:
+        crossed = passage_probability(constraints, x, moved, sigma, length)
+        # All constraints of A must hold, and one of B suffices.
+        ended = under_way * (crossed.amin(-1) if reached else 1 - (1 - crossed).prod(-1))
+        under_way, result = under_way - ended, result + (ended if reached else 0)
+    return result + under_way * value(left, moved)
 
 
 def _foot(problem: ReachAvoidProblem, mesh: Mesh, x: torch.Tensor, u: torch.Tensor, dt: float):
