@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import math
+import pickle
 
 import pytest
 import torch
 from oracles import PROBLEMS, name
 
 from pirl_rl.errors import ProblemError
+from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems import Reach1D, Safety1D, VehicleDrift
 from pirl_rl.problems.drift.starts import EquilibriumStates
 from pirl_rl.sampling.faces import NearFaces
 from pirl_rl.sampling.initial_states import UniformStates, VisitedStates, sample_interior
+from pirl_rl.sampling.undecided import UndecidedStates
+from pirl_rl.sampling.wider import WIDEST, WiderStates
 from pirl_rl.sets import Box
+from pirl_rl.simulator import Simulator
 
 COUNT = 20_000
 
@@ -176,8 +181,86 @@ def test_states_near_faces_are_outside_both_sets(problem):
         (lambda: VisitedStates(UniformStates(), 1.5), "0 <= share <= 1"),
         (lambda: NearFaces(UniformStates(), -0.1), "0 <= share <= 1"),
         (lambda: NearFaces(UniformStates(), decades=0.0), "decades > 0"),
+        (lambda: WiderStates(UniformStates(), Simulator(Reach1D()), 1.5), "0 <= share <= 1, got 1.5"),
+        (lambda: UndecidedStates(UniformStates(), Known(), 0.0), "0 < floor <= 1 and candidates >= 1, got 0.0 and 4"),
+        (lambda: UndecidedStates(UniformStates(), Known(), 0.2, 0), "candidates >= 1, got 0.2 and 0"),
     ],
 )
-def test_drift_laws_name_the_key(law, message):
+def test_laws_name_what_is_wrong(law, message):
     with pytest.raises(ValueError, match=message):
         law()
+
+
+class Stream(ReachAvoidProblem):
+    """A stream of constant speed along x, and beside it a periodic angle that turns; no set is near."""
+
+    states, controls = Box([0.0, -1.0], [1.0, 1.0], periodic=[1]), Box([-1.0], [1.0])
+
+    def __init__(self, horizon: float):
+        self.horizon = horizon
+
+    def drift(self, x, u):
+        return torch.stack([torch.ones_like(x[..., 0]), u[..., 0]], -1)
+
+    def diffusion(self, x, u):
+        return 1e-6 * torch.eye(2, dtype=x.dtype).expand(*x.shape, 2)
+
+    def target_level(self, x):
+        return 10 - x[..., 0]
+
+
+def test_the_wider_box_holds_all_but_a_tail_of_the_states_of_paths():
+    """States U + t, with t uniform in (0, T), pass 1 + T - s with probability s^2 / 2T: 2 % at s = 0.1 for T = 1/4.
+
+    The number of looks shifts the quantile by less than their distance, 0.005. With T = 2 the box may only double.
+    """
+    box = WiderStates(UniformStates(), Simulator(Stream(0.25), 0.005)).box
+    assert box.low == (0.0, -1.0)
+    assert box.periodic == (1,)
+    assert box.high == (pytest.approx(1.15, abs=0.01), 1.0)
+    far = WiderStates(UniformStates(), Simulator(Stream(2.0), 0.05)).box
+    assert far.high == (pytest.approx(0.5 + WIDEST / 2), 1.0)
+
+
+def test_states_from_the_wider_box_take_their_share():
+    """Half of the states are uniform in (0, 1.5), so that a sixth of all lies beyond 1."""
+    problem = Stream(2.0)
+    law = WiderStates(UniformStates(), Simulator(problem, 0.05), share=0.5)
+    _, x = law.sample(problem, COUNT, 40, torch.Generator().manual_seed(0), torch.float64)
+    assert (x[:, 0] > 1).double().mean().item() == pytest.approx(1 / 6, abs=5 * (5 / 36 / COUNT) ** 0.5)
+    assert x[:, 0].max() <= 1.5
+
+
+def test_where_paths_stay_in_the_box_nothing_is_wider():
+    """The avoid set of Safety1D lies inside of the box, so that no path leaves it."""
+    problem = Safety1D()
+    law = WiderStates(UniformStates(), Simulator(problem, 0.05))
+    assert law.box is None
+    assert torch.equal(draw(problem, law)[1], draw(problem, UniformStates())[1])
+
+
+class Known:
+    """V = 1/2 where x > 0 and more than half of the horizon is left, else 1."""
+
+    def value(self, tau, x):
+        return torch.where((x[:, 0] > 0) & (tau > 0.5), 0.5, 1.0)
+
+
+def test_undecided_states_come_by_their_weights():
+    """A quarter of the candidates has the weight 1, the others 0.25: with many candidates 4 of 7 are undecided.
+
+    Without replacement the share is a little smaller, since the undecided candidates become fewer: with 50 candidates
+    for each state by less than 0.01.
+    """
+    problem, count = Stream(1.0), 2_000
+    others = UniformStates([-1.0, -1.0], [1.0, 1.0])
+    law = UndecidedStates(others, Known(), floor=0.25, candidates=50)
+    steps, x = law.sample(problem, count, 40, torch.Generator().manual_seed(0), torch.float64)
+    assert (steps.shape, x.shape) == ((count,), (count, 2))
+    undecided = (x[:, 0] > 0) & (steps > 20)
+    assert undecided.double().mean().item() == pytest.approx(4 / 7, abs=0.01 + 4 * (12 / 49 / count) ** 0.5)
+
+
+def test_copies_for_other_processes_draw_with_equal_weights():
+    law = pickle.loads(pickle.dumps(UndecidedStates(UniformStates(), Known())))
+    assert torch.equal(draw(Safety1D(), law)[1], draw(Safety1D(), UniformStates())[1])

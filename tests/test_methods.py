@@ -146,10 +146,10 @@ def test_every_constructor_argument_is_a_key(overrides):
     found = {key: node for key, node in nodes(config) if key.partition(".")[0] not in ("pirl", "td3", "hydra")}
     assert {"actor", "critic", "loss", "learner", "trainer", "env", "env.initial_states", "collector"} <= found.keys()
     for key, node in found.items():
-        # The collector's law of starts is mixed with that of the environment, which stands there.
+        # The collector's laws of starts end with that of the environment, which stands there.
         # An experiment replaces the actor rule, whose arguments therefore stand nowhere.
-        supplied = {"collector.initial_states": {"others"}, "loss.actor_rule": {"steps", "levels", "budget", "inertia"}}
-        supplied = supplied.get(key, set())
+        actor_rule = {"steps", "levels", "budget", "inertia"}
+        supplied = {"collector.initial_states.others.others": {"others"}, "loss.actor_rule": actor_rule}.get(key, set())
         assert {*node} | supplied >= {*arguments(node._target_)}, key
 
 
@@ -188,7 +188,7 @@ def test_arguments_that_no_yaml_file_names_are_reached(typed):
     trainer = make_trainer(compose("train", ["+experiment=reach1d", "+debug=default", typed]))
     found = {
         "env.problem.horizon": trainer.solution.problem.horizon,
-        "env.initial_states.tau": trainer.collector.initial_states.others.tau,
+        "env.initial_states.tau": trainer.collector.initial_states.others.others.others.tau,
         "loss.logit_penalty": trainer.learner.loss.logit_penalty,
     }
     key, _, value = typed.partition("=")

@@ -1,0 +1,105 @@
+"""Initial states beyond the box of states, as far as paths go.
+
+No face need stop a path at the edge of `problem.states`, and the best way to the target may lead out of the box, round
+and back. V and the policy are then needed where no episode would start.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from pirl_rl.errors import ArgumentError
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.sampling.initial_states import InitialStates
+from pirl_rl.sets import Box
+from pirl_rl.simulator import Simulator
+
+PATHS = 512
+"""The number of paths that show how far paths go."""
+
+LOOKS = 50
+"""The number of times, evenly over the horizon, at which their states are noted."""
+
+TAIL = 0.02
+"""The share of the noted states that may lie beyond the wider box on one side of an axis."""
+
+WIDEST = 2.0
+"""The largest width of the wider box along an axis, in widths of `states`, as far as it grows equally on both sides."""
+
+
+class WiderStates:
+    """Some of the states uniform in the box that paths stay in, the rest from another distribution.
+
+    A state of the wider box that lies in A or B, or is unreachable, is replaced by one of the other distribution.
+
+    Args:
+        others: the other distribution, which also gives the steps to go of all episodes.
+        simulator: plays the paths that show how far paths go.
+        share: the probability of a state from the wider box, in [0, 1].
+
+    Attributes:
+        box: the wider box, see `box_of_paths`; None where paths stay in `states`, and then all states are from the
+            other distribution.
+
+    Raises:
+        ArgumentError: `share` is out of range.
+    """
+
+    def __init__(self, others: InitialStates, simulator: Simulator, share: float = 0.5):
+        if not 0 <= share <= 1:
+            raise ArgumentError(f"initial_states: expected 0 <= share <= 1, got {share}")
+        self.others, self.share = others, share
+        states, wider = simulator.problem.states, box_of_paths(simulator, others)
+        self.box = None if (wider.low, wider.high) == (states.low, states.high) else wider
+
+    def sample(
+        self,
+        problem: ReachAvoidProblem,
+        count: int,
+        max_steps: int,
+        rng: torch.Generator,
+        dtype: torch.dtype,
+        visited: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        steps, x = self.others.sample(problem, count, max_steps, rng, dtype, visited)
+        if self.box is None:
+            return steps, x
+        wide = self.box.sample(count, rng, dtype, rng.device)
+        taken = torch.rand(count, generator=rng, device=rng.device) < self.share
+        taken = taken & problem.interior(wide) & ~problem.unreachable(wide)
+        return steps, torch.where(taken.unsqueeze(-1), wide, x)
+
+
+def box_of_paths(simulator: Simulator, starts: InitialStates) -> Box:
+    """The smallest box that holds `states` and, on each side of each axis, all but `TAIL` of the states of paths.
+
+    The paths start as the distribution `starts` says, each has one control for the whole horizon, drawn uniformly, and
+    A and B stop them. A periodic axis is not widened, and no side moves out by more than `WIDEST` allows.
+    """
+    # Crossings within a step cost the most, and here a path may as well stop a step later.
+    simulator = replace(simulator, crossing="endpoint", compile=False)
+    problem, steps, rng = simulator.problem, simulator.clock.max_steps, torch.Generator().manual_seed(0)
+    _, x = starts.sample(problem, PATHS, steps, rng, torch.get_default_dtype())
+    u, noted = problem.controls.sample(PATHS, rng, x.dtype), [x]
+    for count in range(1, steps + 1):
+        step = simulator.step(x, u, rng)
+        # A drift without a value beyond the box must not spoil the quantiles.
+        goes_on = ~(step.reached | step.failed) & step.state.isfinite().all(-1)
+        x, u = step.state[goes_on], u[goes_on]
+        if not len(x):
+            break
+        if count % max(1, steps // LOOKS) == 0:
+            noted.append(x)
+    z = problem.states.normalize(torch.cat(noted)).double().sort(0).values
+    tail = round(TAIL * len(z))
+    low, high = list(problem.states.low), list(problem.states.high)
+    for axis in set(range(problem.states.dim)) - set(problem.states.periodic):
+        middle, half = (low[axis] + high[axis]) / 2, (high[axis] - low[axis]) / 2
+        below, above = z[tail, axis].item(), z[-1 - tail, axis].item()
+        # An edge that does not move keeps every digit.
+        low[axis] = low[axis] if below >= -1 else middle + half * max(below, -WIDEST)
+        high[axis] = high[axis] if above <= 1 else middle + half * min(above, WIDEST)
+    return Box(low, high, problem.states.periodic)
