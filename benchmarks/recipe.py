@@ -20,6 +20,8 @@ VARIANTS: dict[str, list[str]] = {
     "no levels": ["actor.levels=false", "critic.levels=false", "critic.log_levels=false"],
     "no control variate": ["collector.control_variate=null"],
     "no faces": [f"{STATES}.share=0"],
+    "equal weights of starts": [f"{STATES}.others.floor=1"],
+    "starts in the box alone": [f"{STATES}.others.others.share=0"],
     "no spread": ["actor.spread=null", "critic.spread=null"],
     "ascent of the Hamiltonian": ["pirl.actor_rule={_target_:pirl_rl.actor_rules.Hamiltonian}"],
     "no last stage": ["pirl.stages=[]"],

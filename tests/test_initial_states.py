@@ -16,7 +16,7 @@ from pirl_rl.problems.drift.starts import EquilibriumStates
 from pirl_rl.sampling.faces import NearFaces
 from pirl_rl.sampling.initial_states import UniformStates, VisitedStates, sample_interior
 from pirl_rl.sampling.undecided import UndecidedStates
-from pirl_rl.sampling.wider import WIDEST, WiderStates
+from pirl_rl.sampling.wider import FARTHEST, WiderStates
 from pirl_rl.sets import Box
 from pirl_rl.simulator import Simulator
 
@@ -219,7 +219,7 @@ def test_the_wider_box_holds_all_but_a_tail_of_the_states_of_paths():
     assert box.periodic == (1,)
     assert box.high == (pytest.approx(1.15, abs=0.01), 1.0)
     far = WiderStates(UniformStates(), Simulator(Stream(2.0), 0.05)).box
-    assert far.high == (pytest.approx(0.5 + WIDEST / 2), 1.0)
+    assert far.high == (pytest.approx(0.5 + FARTHEST / 2), 1.0)
 
 
 def test_states_from_the_wider_box_take_their_share():

@@ -26,8 +26,8 @@ LOOKS = 50
 TAIL = 0.02
 """The share of the noted states that may lie beyond the wider box on one side of an axis."""
 
-WIDEST = 2.0
-"""The largest width of the wider box along an axis, in widths of `states`, as far as it grows equally on both sides."""
+FARTHEST = 2.0
+"""The largest coordinate of an edge of the wider box, in coordinates in which `states` is [-1, 1]^n."""
 
 
 class WiderStates:
@@ -77,7 +77,7 @@ def box_of_paths(simulator: Simulator, starts: InitialStates) -> Box:
     """The smallest box that holds `states` and, on each side of each axis, all but `TAIL` of the states of paths.
 
     The paths start as the distribution `starts` says, each has one control for the whole horizon, drawn uniformly, and
-    A and B stop them. A periodic axis is not widened, and no side moves out by more than `WIDEST` allows.
+    A and B stop them. A periodic axis is not widened, and no side moves out farther than `FARTHEST`.
     """
     # Crossings within a step cost the most, and here a path may as well stop a step later.
     simulator = replace(simulator, crossing="endpoint", compile=False)
@@ -100,6 +100,6 @@ def box_of_paths(simulator: Simulator, starts: InitialStates) -> Box:
         middle, half = (low[axis] + high[axis]) / 2, (high[axis] - low[axis]) / 2
         below, above = z[tail, axis].item(), z[-1 - tail, axis].item()
         # An edge that does not move keeps every digit.
-        low[axis] = low[axis] if below >= -1 else middle + half * max(below, -WIDEST)
-        high[axis] = high[axis] if above <= 1 else middle + half * min(above, WIDEST)
+        low[axis] = low[axis] if below >= -1 else middle + half * max(below, -FARTHEST)
+        high[axis] = high[axis] if above <= 1 else middle + half * min(above, FARTHEST)
     return Box(low, high, problem.states.periodic)
