@@ -182,8 +182,14 @@ def test_states_near_faces_are_outside_both_sets(problem):
         (lambda: NearFaces(UniformStates(), -0.1), "0 <= share <= 1"),
         (lambda: NearFaces(UniformStates(), decades=0.0), "decades > 0"),
         (lambda: WiderStates(UniformStates(), Simulator(Reach1D()), 1.5), "0 <= share <= 1, got 1.5"),
-        (lambda: UndecidedStates(UniformStates(), Known(), 0.0), "0 < floor <= 1 and candidates >= 1, got 0.0 and 4"),
-        (lambda: UndecidedStates(UniformStates(), Known(), 0.2, 0), "candidates >= 1, got 0.2 and 0"),
+        (
+            lambda: UndecidedStates(UniformStates(), Known(), Simulator(Reach1D()), 0.0),
+            "0 < floor <= 1 and candidates >= 1, got 0.0 and 4",
+        ),
+        (
+            lambda: UndecidedStates(UniformStates(), Known(), Simulator(Reach1D()), 0.2, 0),
+            "candidates >= 1, got 0.2 and 0",
+        ),
     ],
 )
 def test_laws_name_what_is_wrong(law, message):
@@ -239,6 +245,22 @@ def test_where_paths_stay_in_the_box_nothing_is_wider():
     assert torch.equal(draw(problem, law)[1], draw(problem, UniformStates())[1])
 
 
+def test_a_drift_without_a_value_beyond_the_box_does_not_spoil_the_wider_box():
+    """Paths end where they leave the box, so that it stays as it is."""
+
+    class Torn(Stream):
+        def drift(self, x, u):
+            return torch.where(x[..., :1] > 1, math.nan, super().drift(x, u))
+
+    assert WiderStates(UniformStates(), Simulator(Torn(2.0), 0.01)).box is None
+
+
+def test_paths_of_a_compiled_simulator_are_played_eagerly(monkeypatch):
+    """As paths end their number falls, and each number would be compiled by itself."""
+    monkeypatch.delattr("pirl_rl.simulator.Compiled")
+    assert WiderStates(UniformStates(), Simulator(Stream(2.0), 0.05, compile=True)).box is not None
+
+
 class Known:
     """V = 1/2 where x > 0 and more than half of the horizon is left, else 1."""
 
@@ -254,13 +276,22 @@ def test_undecided_states_come_by_their_weights():
     """
     problem, count = Stream(1.0), 2_000
     others = UniformStates([-1.0, -1.0], [1.0, 1.0])
-    law = UndecidedStates(others, Known(), floor=0.25, candidates=50)
+    law = UndecidedStates(others, Known(), Simulator(problem, 0.025), floor=0.25, candidates=50)
     steps, x = law.sample(problem, count, 40, torch.Generator().manual_seed(0), torch.float64)
     assert (steps.shape, x.shape) == ((count,), (count, 2))
     undecided = (x[:, 0] > 0) & (steps > 20)
     assert undecided.double().mean().item() == pytest.approx(4 / 7, abs=0.01 + 4 * (12 / 49 / count) ** 0.5)
 
 
+def test_networks_that_have_diverged_give_equal_weights():
+    class Diverged:
+        def value(self, tau, x):
+            return torch.full_like(tau, math.nan)
+
+    _, x = draw(Safety1D(), UndecidedStates(UniformStates(), Diverged(), Simulator(Safety1D())))
+    assert Safety1D().interior(x).all()
+
+
 def test_copies_for_other_processes_draw_with_equal_weights():
-    law = pickle.loads(pickle.dumps(UndecidedStates(UniformStates(), Known())))
+    law = pickle.loads(pickle.dumps(UndecidedStates(UniformStates(), Known(), Simulator(Safety1D()))))
     assert torch.equal(draw(Safety1D(), law)[1], draw(Safety1D(), UniformStates())[1])

@@ -37,7 +37,8 @@ class GridSolution:
         coarse: the solution with half as many points and steps, or None, and then the error is not known.
         split: whether drift and noise acted in turns, see `pirl_rl.grid.transport`. V is then not extrapolated from
             `coarse`, since its order is not known. In cells that a face cuts it is that at the end of a short path, see
-            `after_a_cell`: where the noise is weak, V rises from the face within a layer that is thinner than a cell.
+            `pirl_rl.grid.transport.after_a_cell`: where the noise is weak, V rises from the face within a layer that is
+            thinner than a cell.
     """
 
     def __init__(

@@ -9,7 +9,8 @@ has two parts instead. First V moves along the flow,
 a semi-Lagrangian step (M. Falcone and R. Ferretti, Semi-Lagrangian Approximation Schemes for Linear and Hamilton-Jacobi
 Equations, SIAM, 2013), where a path that enters A or B on its way has their value. Then the noise acts for the time dt,
 by the chain without drift. Between nodes V is a cubic spline that is limited to the values at the corners of the cell
-(R. Bermejo and A. Staniforth, Monthly Weather Review 120, 1992), so that it stays in [0, 1].
+(R. Bermejo and A. Staniforth, Monthly Weather Review 120, 1992), so that it stays in [0, 1]. In a cell that a face cuts
+V follows from a short path, see `after_a_cell`.
 """
 
 from __future__ import annotations

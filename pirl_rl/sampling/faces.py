@@ -15,7 +15,7 @@ from torch import Tensor
 from pirl_rl.descent import descended
 from pirl_rl.errors import ArgumentError, ProblemError
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.sampling.initial_states import InitialStates, sample_interior
+from pirl_rl.sampling.initial_states import InitialStates, mixed, sample_interior
 
 FACE_POOL = 16_384
 """The number of points on the faces that are found once, and from which samples are drawn."""
@@ -122,9 +122,8 @@ class NearFaces:
         points, outside = (entry.to(device=device, dtype=dtype)[index] for entry in (faces.points, faces.outside))
         distance = 10 ** (-self.decades * torch.rand((count, 1), generator=rng, dtype=dtype, device=device))
         near = problem.states.wrap(points + distance * (outside - points))
-        taken = torch.rand(count, generator=rng, device=device) < self.share
-        taken = taken & problem.states.contains(near) & problem.interior(near) & ~problem.unreachable(near)
-        return steps, torch.where(taken.unsqueeze(-1), near, x)
+        near = torch.where(problem.states.contains(near).unsqueeze(-1), near, x)
+        return steps, mixed(problem, near, x, self.share, rng)
 
     def _faces(self, problem: ReachAvoidProblem) -> Faces:
         """The faces of a problem within its box of states, found once."""

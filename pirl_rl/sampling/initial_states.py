@@ -125,9 +125,17 @@ class VisitedStates:
         start = visited[torch.randint(len(visited), (count,), generator=rng, device=device)]
         states = problem.states
         near = states.wrap(states.denormalize(moved(states.normalize(start), self.radius, rng)))
-        taken = torch.rand(count, generator=rng, device=device) < self.share
-        taken = taken & problem.interior(near) & ~problem.unreachable(near)
-        return steps, torch.where(taken.unsqueeze(-1), near, x)
+        return steps, mixed(problem, near, x, self.share, rng)
+
+
+def mixed(problem: ReachAvoidProblem, x: Tensor, others: Tensor, share: float, rng: torch.Generator) -> Tensor:
+    """States (N, n): each of x (N, n) with the probability `share`, and else the one of `others` (N, n).
+
+    Where a state of x lies in A or B, or is unreachable, the other one takes its place in any case.
+    """
+    taken = torch.rand(len(x), generator=rng, device=rng.device) < share
+    taken = taken & problem.interior(x) & ~problem.unreachable(x)
+    return torch.where(taken.unsqueeze(-1), x, others)
 
 
 def moved(z: Tensor, radius: float, rng: torch.Generator) -> Tensor:

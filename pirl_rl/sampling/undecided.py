@@ -10,6 +10,7 @@ from torch import Tensor
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.initial_states import InitialStates
+from pirl_rl.simulator import Simulator
 
 
 class HasValue(Protocol):
@@ -27,11 +28,12 @@ class UndecidedStates:
     `candidates` times as many states as are needed, each is therefore drawn, without replacement, with a weight of
     floor + (1 - floor) 4 V (1 - V), where V is that of the networks as they stand, at the time to go of its episode.
 
-    Copies for other processes lose the networks, which would be out of date there, and draw with equal weights.
+    Copies for other processes lose the networks, which would be out of date there, and take the states as they come.
 
     Args:
         others: the other distribution.
         solution: gives V.
+        simulator: its clock turns control steps to go into times to go.
         floor: the weight of a state at which V is 0 or 1, where a state at which V = 1/2 has the weight 1; in (0, 1].
         candidates: the number of candidates for each state, >= 1.
 
@@ -39,12 +41,20 @@ class UndecidedStates:
         ArgumentError: a number is out of range.
     """
 
-    def __init__(self, others: InitialStates, solution: HasValue, floor: float = 0.2, candidates: int = 4):
+    def __init__(
+        self,
+        others: InitialStates,
+        solution: HasValue,
+        simulator: Simulator,
+        floor: float = 0.2,
+        candidates: int = 4,
+    ):
         if not 0 < floor <= 1 or candidates < 1:
             raise ArgumentError(
                 f"initial_states: expected 0 < floor <= 1 and candidates >= 1, got {floor} and {candidates}"
             )
-        self.others, self.solution, self.floor, self.candidates = others, solution, floor, candidates
+        self.others, self.solution, self.clock = others, solution, simulator.clock
+        self.floor, self.candidates = floor, candidates
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"solution": None}
@@ -61,9 +71,8 @@ class UndecidedStates:
         if self.solution is None:
             return self.others.sample(problem, count, max_steps, rng, dtype, visited)
         steps, x = self.others.sample(problem, self.candidates * count, max_steps, rng, dtype, visited)
-        tau = steps.to(x) * (problem.horizon / max_steps)
-        # Networks that have diverged are reported by the trainer.
-        v = self.solution.value(tau, x).nan_to_num(0.5).clamp(0, 1)
+        # The trainer reports networks that have diverged.
+        v = self.solution.value(self.clock.time(steps).to(x), x).nan_to_num(0.5).clamp(0, 1)
         weight = self.floor + (1 - self.floor) * 4 * v * (1 - v)
         chosen = torch.multinomial(weight, count, generator=rng)
         return steps[chosen], x[chosen]

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.sampling.initial_states import InitialStates
+from pirl_rl.sampling.initial_states import InitialStates, mixed
 from pirl_rl.sets import Box
 from pirl_rl.simulator import Simulator
 
@@ -31,7 +31,7 @@ FARTHEST = 2.0
 
 
 class WiderStates:
-    """Some of the states uniform in the box that paths stay in, the rest from another distribution.
+    """Some of the states uniform in a box as wide as paths go, the rest from another distribution.
 
     A state of the wider box that lies in A or B, or is unreachable, is replaced by one of the other distribution.
 
@@ -68,16 +68,18 @@ class WiderStates:
         if self.box is None:
             return steps, x
         wide = self.box.sample(count, rng, dtype, rng.device)
-        taken = torch.rand(count, generator=rng, device=rng.device) < self.share
-        taken = taken & problem.interior(wide) & ~problem.unreachable(wide)
-        return steps, torch.where(taken.unsqueeze(-1), wide, x)
+        return steps, mixed(problem, wide, x, self.share, rng)
 
 
 def box_of_paths(simulator: Simulator, starts: InitialStates) -> Box:
     """The smallest box that holds `states` and, on each side of each axis, all but `TAIL` of the states of paths.
 
-    The paths start as the distribution `starts` says, each has one control for the whole horizon, drawn uniformly, and
-    A and B stop them. A periodic axis is not widened, and no side moves out farther than `FARTHEST`.
+    The paths have starts from a distribution and the whole horizon to go. Each has one constant control, drawn
+    uniformly, and stops in A and B. A periodic axis is not widened, and no edge moves out farther than `FARTHEST`.
+
+    Args:
+        simulator: plays the paths.
+        starts: the distribution of their starts.
     """
     # Crossings within a step cost the most, and here a path may as well stop a step later.
     simulator = replace(simulator, crossing="endpoint", compile=False)
