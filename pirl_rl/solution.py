@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pirl_rl.networks import Actor, Critic
+from pirl_rl.networks import Actor, Critic, CriticValue
 from pirl_rl.operators import generator
 from pirl_rl.problem import ReachAvoidProblem
 
@@ -66,7 +66,7 @@ class Solution:
     def raw_value(self, tau: Tensor, x: Tensor) -> Tensor:
         """V (N,) as the networks give it, neither clipped nor corrected inside A and B."""
         tau, x = self._own(tau, x)
-        return self.critic.at(self._action(tau, x))(tau, x).mean(0)
+        return self._critics(tau, x)(tau, x).mean(0)
 
     @torch.no_grad()
     def value(self, tau: Tensor, x: Tensor) -> Tensor:
@@ -99,20 +99,24 @@ class Solution:
         """The gradient of `raw_value` in x (N, n), per unit of the state; the action of the critics is frozen."""
         with torch.no_grad():
             tau, x = self._own(tau, x)
-            value = self.critic.at(self._action(tau, x))
+            value = self._critics(tau, x)
             return torch.func.grad(lambda y: value(tau, y).mean(0).sum())(x)
 
     def hessian(self, tau: Tensor, x: Tensor) -> Tensor:
         """The second derivatives of `raw_value` in x (N, n, n); the action of the critics is frozen."""
         with torch.no_grad():
             tau, x = self._own(tau, x)
-            value = self.critic.at(self._action(tau, x))
+            value = self._critics(tau, x)
             slope = torch.func.grad(lambda y: value(tau, y).mean(0).sum())
             columns = [torch.func.jvp(slope, (x,), (axis.expand_as(x),))[1] for axis in torch.eye(x.shape[-1]).to(x)]
             return torch.stack(columns, -1)
 
     def _own(self, tau: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         return tau.to(self.dtype), self.problem.states.wrap(x.to(self.dtype))
+
+    def _critics(self, tau: Tensor, x: Tensor) -> CriticValue:
+        """The critics with the action frozen at that of the policy, which is computed only for critics Q(tau, x, u)."""
+        return self.critic.at(self._action(tau, x) if self.critic.action_input else x.new_empty(len(x), 0))
 
     def _action(self, tau: Tensor, x: Tensor) -> Tensor:
         return self.actor(tau.unsqueeze(-1), x)

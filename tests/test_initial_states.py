@@ -228,6 +228,17 @@ def test_the_wider_box_holds_all_but_a_tail_of_the_states_of_paths():
     assert far.high == (pytest.approx(0.5 + FARTHEST / 2), 1.0)
 
 
+def test_edges_that_move_out_are_announced(capsys):
+    WiderStates(UniformStates(), Simulator(Stream(2.0), 0.05))
+    assert "starts: Paths leave the box of states" in (text := capsys.readouterr().err)
+    assert "from 0 to 1.5 along axis 0." in text
+
+
+def test_a_share_of_zero_plays_no_paths(monkeypatch):
+    monkeypatch.delattr("pirl_rl.sampling.wider.box_of_paths")
+    assert WiderStates(UniformStates(), Simulator(Stream(2.0), 0.05), share=0).box is None
+
+
 def test_states_from_the_wider_box_take_their_share():
     """Half of the states are uniform in (0, 1.5), so that a sixth of all lies beyond 1."""
     problem = Stream(2.0)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.progress import announce
 from pirl_rl.sampling.initial_states import InitialStates, mixed
 from pirl_rl.sets import Box
 from pirl_rl.simulator import Simulator
@@ -41,8 +42,8 @@ class WiderStates:
         share: the probability of a state from the wider box, in [0, 1].
 
     Attributes:
-        box: the wider box, see `box_of_paths`; None where paths stay in `states`, and then all states are from the
-            other distribution.
+        box: the wider box, see `box_of_paths`; None where paths stay in `states` or `share` is 0, and then all states
+            are from the other distribution.
 
     Raises:
         ArgumentError: `share` is out of range.
@@ -52,8 +53,14 @@ class WiderStates:
         if not 0 <= share <= 1:
             raise ArgumentError(f"initial_states: expected 0 <= share <= 1, got {share}")
         self.others, self.share = others, share
-        states, wider = simulator.problem.states, box_of_paths(simulator, others)
-        self.box = None if (wider.low, wider.high) == (states.low, states.high) else wider
+        states = simulator.problem.states
+        box = box_of_paths(simulator, others) if share else states
+        edges, wider = ([*zip(one.low, one.high, strict=True)] for one in (states, box))
+        moved = [axis for axis in range(states.dim) if edges[axis] != wider[axis]]
+        self.box = box if moved else None
+        if moved:
+            reach = ", ".join("from {:.3g} to {:.3g} along axis {}".format(*wider[axis], axis) for axis in moved)
+            announce(f"starts: Paths leave the box of states. Some episodes start in a wider box, {reach}.")
 
     def sample(
         self,
