@@ -56,7 +56,8 @@ def main() -> None:
 
 
 def _cell(folder: Path, seeds: list[str]) -> str:
-    scores = [json.loads((folder / seed / "score.json").read_text(encoding="utf-8")) for seed in seeds]
+    files = [path for seed in seeds for path in (folder / seed).glob("score-*.json")]
+    scores = [json.loads(path.read_text(encoding="utf-8")) for path in files]
     mse, loss = (sum(score[key] for score in scores) / len(scores) for key in ("mse", "loss"))
     return f"{mse:.1e}, {loss:.4f}"
 

@@ -137,17 +137,24 @@ def test_the_table_names_the_worst_seed():
 def test_the_command_goes_on_where_it_stopped(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     main([*SMALL, "seeds=[3]"])
-    first = json.loads((tmp_path / "runs/suite/exit1d/3/score.json").read_text())
+    first = json.loads((tmp_path / "runs/suite/exit1d/3/score-50-20.json").read_text())
     assert first["updates"] == 20
     assert (tmp_path / "runs/suite/suite.png").is_file()
     capsys.readouterr()
     (tmp_path / "runs/suite/exit1d/4/checkpoints").mkdir(parents=True)  # a run that was killed early
     main([*SMALL, "seeds=[3,4]"])
-    assert json.loads((tmp_path / "runs/suite/exit1d/3/score.json").read_text()) == first
+    assert json.loads((tmp_path / "runs/suite/exit1d/3/score-50-20.json").read_text()) == first
     printed = capsys.readouterr().out
     assert "seed=4" in printed
     assert "seed=3" not in printed
     assert (tmp_path / "runs/suite/suite.md").read_text().strip() in printed
+    main([*SMALL, "seeds=[3]", "rollouts=40"])
+    again = json.loads((tmp_path / "runs/suite/exit1d/3/score-50-40.json").read_text())
+    assert again["mse"] == first["mse"]
+    assert again["gap_noise"] < first["gap_noise"]
+    with pytest.raises(SystemExit):
+        main([*SMALL, "seeds=[3]", "trainer.updates=30"])
+    assert re.search(r"out: expected a new directory.*trainer\.updates=30", capsys.readouterr().err)
 
 
 @pytest.mark.parametrize(
@@ -178,7 +185,7 @@ def test_alternatives_stand_in_the_table_and_are_kept(tmp_path, capsys, monkeypa
     main([*asked, "against=[grid,lqr]"])
     table = (tmp_path / "runs/suite/suite.md").read_text().splitlines()
     assert table[0].endswith("| Time of the grid | Success of LQR |")
-    found = json.loads((tmp_path / "runs/suite/double_integrator/lqr.json").read_text())
+    found = json.loads((tmp_path / "runs/suite/double_integrator/lqr-30-10.json").read_text())
     assert table[2].endswith(f"| {found['success']:.3f} |")
     assert 0 < found["success"] <= 1
     assert re.search(r"\| \d+\.\d s \|", table[2])

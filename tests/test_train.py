@@ -273,7 +273,7 @@ def test_a_sweep_that_is_started_again_repeats_nothing(cli, tmp_path):
     assert [len(read_sessions(run)) for run in (finished, begun)] == [1, 2]
     code, text = cli(*sweep, "method=pirl", "seed=0,1")
     assert code == 1
-    assert "expected a new directory or that of the same sweep" in text
+    assert "expected a new directory, or that of runs with the same settings" in text
     assert {path: path.stat().st_mtime_ns for path in finished.path.rglob("*")} == before
 
 

@@ -37,7 +37,7 @@ from omegaconf.errors import OmegaConfBaseException
 from pirl_rl.assembly import make_problem
 from pirl_rl.commands.composition import compose
 from pirl_rl.commands.console import program, reported
-from pirl_rl.commands.train import resume, train_new
+from pirl_rl.commands.train import refuse_other_settings, resume, train_new
 from pirl_rl.configuration import load_config
 from pirl_rl.errors import ConfigError
 from pirl_rl.figures import draw_suite, save_figures
@@ -145,10 +145,11 @@ def _truth(folder: Path, name: str, overrides: Sequence[str], states: int) -> Tr
 
 def _score(folder: Path, name: str, overrides: Sequence[str], truth: Truth, rollouts: int) -> Score:
     """The score of a run in the folder, which is trained and measured first, as far as that is not done."""
-    path, run = folder / "score.json", RunDirectory(folder)
+    path, run = folder / f"score-{len(truth.x)}-{rollouts}.json", RunDirectory(folder)
+    typed = [*PROBLEMS[name], *overrides]
+    refuse_other_settings(run, typed, "out")
     if path.is_file():
         return Score(**json.loads(path.read_text(encoding="utf-8")))
-    typed = [*PROBLEMS[name], *overrides]
     if not run.summary.is_file():
         print(f"{name}: {' '.join(overrides)}", flush=True)
         if run.last.is_file():
@@ -174,7 +175,7 @@ def _alternative(
 
     The grid is timed anew, because its goal is the error of the worst run, which changes with the seeds.
     """
-    path = folder / f"{other}.json"
+    path = folder / f"{other}-{len(truth.x)}-{options['rollouts']}.json"
     if path.is_file() and other != "grid":
         found = json.loads(path.read_text(encoding="utf-8"))
         return None if found is None else Alternative(**found)

@@ -79,16 +79,32 @@ def train_in_sweep(config: DictConfig, folder: Path, overrides: Sequence[str]) -
     run = RunDirectory(folder)
     if not run.config.exists():
         return train_new(config, folder, overrides)
-    recorded = OmegaConf.load(run.overrides) if run.overrides.exists() else None
-    if recorded != overrides:
-        raise ConfigError(
-            f"hydra.sweep.dir: expected a new directory or that of the same sweep, but {folder} holds a run with "
-            f"{' '.join(recorded or ['unknown settings'])} in place of {' '.join(overrides)}"
-        )
+    refuse_other_settings(run, overrides, "hydra.sweep.dir")
     if run.summary.exists():
         print(f"run      {run} is finished already", flush=True)
         return run.numbers()
     return go_on(folder, [], [*config.trust, *named_modules(overrides)])
+
+
+def refuse_other_settings(run: RunDirectory, overrides: Sequence[str], key: str) -> None:
+    """Refuse a directory that holds a run with other settings, as in a sweep that was started before with others.
+
+    Args:
+        run: the directory, which need not exist.
+        overrides: the overrides that the run should have.
+        key: the setting that names the directory, for the message.
+
+    Raises:
+        ConfigError: the overrides of the run are others, or are not known.
+    """
+    if not run.config.exists():
+        return
+    recorded = OmegaConf.load(run.overrides) if run.overrides.exists() else None
+    if recorded != overrides:
+        raise ConfigError(
+            f"{key}: expected a new directory, or that of runs with the same settings, but {run} holds a run with "
+            f"{' '.join(recorded or ['unknown settings'])} in place of {' '.join(overrides)}"
+        )
 
 
 def train_new(
