@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 
-from pirl_rl.automatic import choose_paths, choose_probes, choose_time_steps, choose_updates
+from pirl_rl.automatic import choose_choices, choose_paths, choose_probes, choose_time_steps, choose_updates
 from pirl_rl.building import build, convert
 from pirl_rl.curriculum import Stage
 from pirl_rl.envs import ReachAvoidEnv
@@ -44,7 +44,8 @@ def pick_device(name: str) -> torch.device:
 def make_networks(
     config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[str] = ()
 ) -> tuple[Actor, list[Critic]]:
-    """New networks, the actor and the critics, on the configuration's device."""
+    """New networks, the actor and the critics, on the configuration's device; `auto` in actor.choices is replaced."""
+    choose_choices(config, problem, trust)
     device = pick_device(config.device)
     actor = build(config.actor, "actor", trust, problem=problem).to(device)
     count = convert(config.critics, Literal[1, 2], "critics")

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from omegaconf import DictConfig
+from collections.abc import Sequence
 
-from pirl_rl.building import convert
+from omegaconf import DictConfig, OmegaConf
+
+from pirl_rl.building import convert, resolve
 from pirl_rl.errors import ArgumentError, ConfigError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
-from pirl_rl.structure import check_problem, noise_channels
+from pirl_rl.structure import check_problem, has_controlled_noise, noise_channels
 from pirl_rl.time_steps import check_time_steps, propose_time_steps
 
 AUTO = "auto"
 """The value that leaves a choice to the package.
 
-Keys that take it: env.dt, env.substeps, trainer.updates, loss.hjb_probes and the entries of `PATHS`.
+Keys that take it: env.dt, env.substeps, trainer.updates, actor.choices, loss.hjb_probes and the entries of `PATHS`.
 """
 
 UPDATES_PER_DIMENSION, FEW_STATES, UPDATES_OF_MANY = 2_300, 3, 2_900
@@ -28,6 +30,9 @@ BASE_COST, MOST_COST = 80, 1_700_000
 
 The number of updates that is chosen, times this sum, is at most MOST_COST.
 """
+
+CHOICES = 5
+"""The number of values of each coordinate of the control among which an actor chooses."""
 
 PATHS = {
     ("success", "episodes"): (10_000, 1_000),
@@ -80,6 +85,25 @@ def choose_updates(config: DictConfig, problem: ReachAvoidProblem) -> None:
             config.trainer.updates = min(UPDATES_PER_DIMENSION * (n + 1), MOST_OF_FEW)
         else:
             config.trainer.updates = min(UPDATES_OF_MANY * (n + 1), max(1, MOST_COST // (BASE_COST + n)))
+
+
+def choose_choices(config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[str] = ()) -> None:
+    """Replace `auto` in actor.choices by a number where the noise depends on the control, else by None.
+
+    Where noise grows with |u|, the worst control lies between two good ones, and a continuous policy that changes from
+    one to the other passes through it. An actor rule that needs the gradient of the policy has no choices either.
+
+    Args:
+        config: the configuration of a run.
+        problem: the physics.
+        trust: modules outside the package that may hold the actor rule.
+    """
+    if not isinstance(config.actor, DictConfig) or config.actor.get("choices") != AUTO:
+        return
+    key = "loss.actor_rule._target_"
+    target = OmegaConf.select(config, key)
+    trains = target is not None and getattr(resolve(target, key, trust), "trains_choices", None) is True
+    config.actor.choices = CHOICES if trains and has_controlled_noise(problem) else None
 
 
 def choose_paths(config: DictConfig, problem: ReachAvoidProblem, simulator: Simulator) -> None:

@@ -11,6 +11,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
+from pirl_rl.errors import ArgumentError
+
 
 class Dense(nn.Linear):
     """x W^T + b (*, N, out) of x (*, N, in); weight (*, out, in) and bias (*, out) may be stacked."""
@@ -165,3 +167,33 @@ class Periodic(nn.Module):
 
     def forward(self, z: Tensor) -> Tensor:
         return self.waves(self.widened(z))[0]
+
+
+class Choice(nn.Module):
+    """For each of m outputs, that of k numbers evenly spaced over [-1, 1] which has the largest of its k scores.
+
+    It maps scores (*, m k) to (*, m). The output has no gradient in the scores.
+
+    Args:
+        choices: the number k, at least 2.
+
+    Raises:
+        ArgumentError: `choices` is no integer of at least 2.
+    """
+
+    def __init__(self, choices: int):
+        super().__init__()
+        if not (isinstance(choices, int) and choices >= 2):
+            raise ArgumentError(f"choices: expected an integer of at least 2, got {choices!r}")
+        self.choices = choices
+
+    def forward(self, scores: Tensor) -> Tensor:
+        return self.numbers(scores.unflatten(-1, (-1, self.choices)).argmax(-1)).to(scores.dtype)
+
+    def numbers(self, index: Tensor) -> Tensor:
+        """The numbers (*) with indices (*) from 0 to k - 1."""
+        return 2 * index / (self.choices - 1) - 1
+
+    def indices(self, numbers: Tensor) -> Tensor:
+        """The indices (*) of the choices that are nearest to numbers (*) in [-1, 1]."""
+        return ((numbers + 1) * ((self.choices - 1) / 2)).round().long()

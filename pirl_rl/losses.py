@@ -101,6 +101,7 @@ class PIRLLoss(ScheduledTD3Loss):
     ):
         for critic in critics:
             actor_rule.check(critic)
+        _check_choices(actor, actor_rule)
         td = TemporalDifferences(td_criterion, target_critics, policy_noise, noise_clip)
         if td_criterion == "cross_entropy" and not all(isinstance(critic.layers[-1], nn.Sigmoid) for critic in critics):
             raise ArgumentError("loss.td_criterion: 'cross_entropy' needs critics with output 'Sigmoid'")
@@ -213,6 +214,7 @@ class PIRLLoss(ScheduledTD3Loss):
             ArgumentError: with what was expected and what was got.
         """
         rule.check(self.qvalue_network.module, exploration_noise)  # type: ignore[arg-type]
+        _check_choices(self.actor_network.module, rule)  # type: ignore[arg-type]
 
     def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """`critic_loss`, under the name that `TD3Loss` has for it."""
@@ -227,6 +229,14 @@ class PIRLLoss(ScheduledTD3Loss):
         """The solution on the parameters of this loss: it follows the training."""
         networks = self.networks
         return Solution(self.problem, networks.actor, networks.critic)
+
+
+def _check_choices(actor: Actor, rule: ActorRule) -> None:
+    if actor.choice and not rule.trains_choices:
+        raise ArgumentError(
+            f"actor_rule: expected BestControl with actor.choices={actor.choice.choices}, since the output of such an "
+            f"actor has no gradient, got {type(rule).__name__}"
+        )
 
 
 def _module(network: TensorDictModule, params: TensorDictBase) -> Any:

@@ -15,6 +15,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from pirl_rl.layers import Choice
 from pirl_rl.perceptrons import initialise_xavier, perceptron, spread_zeros
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sets import Box
@@ -34,9 +35,14 @@ class Actor(nn.Module):
             points that are uniform in the box. None takes the usual initialisation, for which all zeros pass near the
             middle of the box.
         levels: whether the levels of the constraints of A and B are inputs too, see `Levels`.
+        choices: None makes each coordinate of the control a hyperbolic tangent. With an integer of at least 2 it is one
+            of so many numbers evenly spaced over [-1, 1], bounds included, each of which has a score, see `Choice`. The
+            control may then jump between two of them along a surface, where a tangent has to pass through all between
+            them. It has no gradient, so that only `BestControl` can train it.
 
     Raises:
-        ArgumentError: `activation` is not the name of a layer of `torch.nn`, or `spread` is not positive.
+        ArgumentError: `activation` is not the name of a layer of `torch.nn`, `spread` is not positive, or `choices` is
+            no integer of at least 2.
     """
 
     def __init__(
@@ -48,15 +54,17 @@ class Actor(nn.Module):
         root_time: bool = False,
         spread: float | None = None,
         levels: bool = False,
+        choices: int | None = None,
     ):
         super().__init__()
-        self.layers = perceptron(
-            problem, 0, hidden, problem.controls.dim, activation, "Tanh", root_time, scaling, levels
-        )
+        self.choice = None if choices is None else Choice(choices)
+        outputs = problem.controls.dim * (1 if choices is None else choices)
+        output = self.choice or "Tanh"
+        self.layers = perceptron(problem, 0, hidden, outputs, activation, output, root_time, scaling, levels)
         spread_zeros(self.layers, spread, problem, 0)
 
     def logits(self, tau: Tensor, state: Tensor) -> Tensor:
-        """The output (N, m) before the hyperbolic tangent of the last layer."""
+        """The input of the last layer: (N, m) of the hyperbolic tangent, or the scores (N, m k) of k choices."""
         return self.layers[:-1](torch.cat([tau, state], -1))
 
     def forward(self, tau: Tensor, state: Tensor) -> Tensor:

@@ -29,7 +29,7 @@ def perceptron(
     hidden: Sequence[int],
     outputs: int,
     activation: str,
-    output: str | None,
+    output: str | nn.Module | None,
     root_time: bool,
     scaling: Box | None,
     levels: bool,
@@ -43,7 +43,7 @@ def perceptron(
         hidden: widths of the hidden layers.
         outputs: the number of outputs.
         activation: the name of the layer of `torch.nn` that follows each hidden layer.
-        output: the name of the last layer, which follows the outputs; None for none.
+        output: the last layer, which follows the outputs, or its name in `torch.nn`; None for none.
         root_time, scaling, levels, log_levels: see `pirl_rl.networks.Critic`.
 
     Raises:
@@ -79,7 +79,8 @@ def perceptron(
     for wide in hidden:
         layers += [Dense(width, wide), _activation("activation", activation)]
         width = wide
-    return nn.Sequential(*layers, Dense(width, outputs), *([] if output is None else [_activation("output", output)]))
+    last = _activation("output", output) if isinstance(output, str) else output
+    return nn.Sequential(*layers, Dense(width, outputs), *([] if last is None else [last]))
 
 
 def _constraints(problem: ReachAvoidProblem, kept: Sequence[int] | None, x: Tensor) -> Tensor:

@@ -12,7 +12,10 @@ from torch import Tensor
 from pirl_rl import Box, ReachAvoidProblem
 from pirl_rl.actor_rules import BestControl, Hamiltonian
 from pirl_rl.ascent import ascend, continued_value, expected_ahead, hamiltonian, improved, value_ahead
-from pirl_rl.errors import ArgumentError
+from pirl_rl.assembly import make_trainer
+from pirl_rl.automatic import choose_choices
+from pirl_rl.commands.composition import compose
+from pirl_rl.errors import ArgumentError, ConfigError
 from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.problems import Reach1D
 from pirl_rl.simulator import Simulator
@@ -270,6 +273,44 @@ def test_the_rule_turns_a_saturated_actor_round_where_the_gradient_of_the_hamilt
     # tanh'(-12) is 1.5e-10, and the rule's own gradient is T w (a - pi) = 2 * 2 * 2 for a slope of 1.
     assert pushed[BestControl] == pytest.approx(8.0, rel=1e-3)
     assert abs(pushed[Hamiltonian]) < 1e-8
+
+
+def test_the_rule_raises_the_score_of_the_best_choice():
+    """For the slope 1 the range of the Hamiltonian is 2 at every state, and the gradient 2 T (softmax - one-hot)."""
+    problem = Reach1D()
+    tau, x = points(problem, 256)
+    replay = TensorDict({"tau": tau.unsqueeze(-1), "state": x}, batch_size=[256])
+    solution = Solution(problem, Actor(problem, choices=3), stack([Rising(problem)]))
+    last = solution.actor.layers[-2]
+    torch.nn.init.zeros_(last.weight)
+    torch.nn.init.zeros_(last.bias)
+    (-BestControl(problem, Simulator(problem, 0.1))(solution, replay, replay)).backward()
+    expected = 2 * problem.horizon * torch.tensor([1 / 3, 1 / 3, -2 / 3])
+    assert torch.allclose(last.bias.grad, expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("controlled", "typed", "choices"),
+    [
+        (False, [], None),
+        (True, [], 5),
+        (True, ["actor.choices=3"], 3),
+        (True, ["actor.choices=null"], None),
+        (True, ["pirl.actor_rule._target_=pirl_rl.actor_rules.Hamiltonian"], None),
+        (True, ["method=td3"], None),
+    ],
+)
+def test_the_actor_chooses_where_the_noise_depends_on_the_control(controlled, typed, choices):
+    config = compose("train", ["+experiment=reach1d", *typed])
+    choose_choices(config, Steered(controlled))
+    assert config.actor.choices == choices
+
+
+def test_a_rule_that_needs_the_gradient_of_the_policy_refuses_choices():
+    rule = "pirl.actor_rule._target_=pirl_rl.actor_rules.Hamiltonian"
+    config = compose("train", ["+experiment=reach1d", "+debug=default", "actor.choices=5", rule])
+    with pytest.raises(ConfigError, match=r"loss.actor_rule: expected BestControl with actor.choices=5.* Hamiltonian"):
+        make_trainer(config)
 
 
 class Rising(Critic):

@@ -53,12 +53,14 @@ np.savez(sys.argv[3], **answer, **{"meta_" + name: np.array(entry) for name, ent
 """
 
 
-def solution_of(problem: ReachAvoidProblem, critics: int = 1, **settings) -> Solution:
+def solution_of(problem: ReachAvoidProblem, critics: int = 1, choices: int | None = None, **settings) -> Solution:
     """New networks for a problem, with a fixed seed."""
     torch.manual_seed(0)
     features = {"root_time": True, "levels": True, "activation": "SiLU", "spread": 3.0, "hidden": (16,)}
     critic = features | {"output": "Sigmoid", "log_levels": settings.get("levels", True)} | settings
-    return Solution(problem, Actor(problem, **features), stack([Critic(problem, **critic) for _ in range(critics)]))
+    return Solution(
+        problem, Actor(problem, **features, choices=choices), stack([Critic(problem, **critic) for _ in range(critics)])
+    )
 
 
 def points(problem: ReachAvoidProblem, count: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -107,8 +109,9 @@ def dubins(tmp_path_factory) -> tuple[Solution, Path]:
         solution_of(Pendulum(), activation="Tanh"),
         solution_of(VehicleDrift()),
         solution_of(Reach1D(), hidden=()),
+        solution_of(PlanarQuadrotor(), choices=5),
     ],
-    ids=["periodic", "smoothed", "plain", "invariance", "unreachable", "no avoid set"],
+    ids=["periodic", "smoothed", "plain", "invariance", "unreachable", "no avoid set", "choices"],
 )
 def test_the_program_computes_what_the_solution_does(solution):
     """In double precision nothing but rounding differs, of the order of 1e-16 times the slope of the networks."""

@@ -9,7 +9,7 @@ import torch
 from oracles import name
 
 from pirl_rl.errors import ArgumentError
-from pirl_rl.layers import Dense, LogLevels, Periodic, Scaling
+from pirl_rl.layers import Choice, Dense, LogLevels, Periodic, Scaling
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.problems import DubinsCar, HalfSpace, Pendulum, Reach1D, ZermeloBoat
 
@@ -74,6 +74,23 @@ def test_an_actor_may_have_the_root_of_time():
     actor = Actor(ZermeloBoat(), root_time=True)
     assert first_dense(actor).in_features == 4
     assert actor(torch.rand(5, 1), torch.rand(5, 2)).shape == (5, 2)
+
+
+def test_an_actor_chooses_the_number_with_the_largest_score():
+    torch.manual_seed(0)
+    actor = Actor(HalfSpace(dim=3), (16,), choices=5)
+    tau, x = torch.rand(200, 1), torch.randn(200, 3)
+    action, scores = actor(tau, x), actor.logits(tau, x).unflatten(-1, (3, 5))
+    assert {*action.unique().tolist()} == {-1.0, -0.5, 0.0, 0.5, 1.0}
+    index = actor.choice.indices(action)
+    assert torch.equal(scores.gather(-1, index.unsqueeze(-1)).squeeze(-1), scores.amax(-1))
+    assert torch.equal(actor.choice.numbers(index), action)
+
+
+@pytest.mark.parametrize("choices", [1, 2.5])
+def test_choices_that_are_refused(choices):
+    with pytest.raises(ArgumentError, match=f"choices: expected an integer of at least 2, got {choices}"):
+        Choice(choices)
 
 
 @pytest.mark.parametrize("problem", [Reach1D(), ZermeloBoat(), DubinsCar(), Pendulum()], ids=name)

@@ -20,9 +20,11 @@ class ActorRule(ABC):
         compiles_whole: whether the objective is compiled as one function with the rest of the actor's loss. A rule
             that loops over the simulator is not, since the loop would be unrolled into thousands of operations; it
             compiles the body of the loop in `compile`.
+        trains_choices: whether the rule can train an actor that chooses among numbers, whose output has no gradient.
     """
 
     compiles_whole: bool = True
+    trains_choices: bool = False
 
     @abstractmethod
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:

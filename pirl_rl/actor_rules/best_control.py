@@ -30,6 +30,9 @@ class BestControl(ActorRule):
     vanish where the tanh is saturated at the wrong bound: unlike a gradient of the Hamiltonian in u, the rule
     corrects such an action.
 
+    For an actor that chooses among k numbers, see `pirl_rl.networks.Actor`, these are the levels, and CE is the
+    cross-entropy of its scores, -log softmax(scores)_j for the best level j.
+
     Where sigma depends on u, E V after one control step takes the place of the Hamiltonian, divided by dt, see
     `pirl_rl.ascent.expected_ahead`: next to faces the Hessian of a network may have the wrong sign. With more than 64
     noise channels times controls it would be too dear, and the Hamiltonian stays.
@@ -46,7 +49,8 @@ class BestControl(ActorRule):
         simulator: simulates the control steps.
         steps: the number of control steps ahead; 0 takes the Hamiltonian.
         levels: the number of levels of each coordinate of the control among the candidates, bounds included; at least
-            2. None takes two where the Hamiltonian is affine in u, so that they hold its maximum, and else five.
+            2. None takes two where the Hamiltonian is affine in u, so that they hold its maximum, and else five. An
+            actor that chooses among numbers has its own.
         budget: the largest number of points times controls; of more points the first are taken, so that an update of
             the actor does not cost more with more controls. Where candidates are simulated, it is the largest number of
             simulated states. Each level of each control at each point then needs `steps` of them for a look ahead, and
@@ -59,6 +63,8 @@ class BestControl(ActorRule):
     Raises:
         ArgumentError: `steps` or `inertia` is below 0, `levels` below 2, or `budget` below 1.
     """
+
+    trains_choices = True
 
     def __init__(
         self,
@@ -86,14 +92,19 @@ class BestControl(ActorRule):
 
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
         tau, x = points["tau"][: self.points], points["state"][: self.points]
-        logits = solution.actor.logits(tau, x)
+        actor, choice = solution.actor, solution.actor.choice
+        logits = actor.logits(tau, x)
         with torch.no_grad():
-            action = torch.tanh(logits)
+            action = actor.layers[-1](logits)
             objective = self._objective(solution, tau.squeeze(-1), x)
-            levels = torch.linspace(-1, 1, self.levels).to(action)
+            levels = torch.linspace(-1, 1, choice.choices if choice else self.levels).to(action)
             best, weight = improved(objective, action, levels, self.inertia)
-        # pi = tanh(z) is 2 sigmoid(2 z) - 1, so that 2 z is the logit of (1 + pi)/2.
-        entropy = torch.nn.functional.binary_cross_entropy_with_logits(2 * logits, (1 + best) / 2, reduction="none")
+        if choice:
+            scores = logits.unflatten(-1, (-1, choice.choices))
+            entropy = torch.nn.functional.cross_entropy(scores.movedim(-1, 1), choice.indices(best), reduction="none")
+        else:
+            # pi = tanh(z) is 2 sigmoid(2 z) - 1, so that 2 z is the logit of (1 + pi)/2.
+            entropy = torch.nn.functional.binary_cross_entropy_with_logits(2 * logits, (1 + best) / 2, reduction="none")
         duration = self.simulator.dt if self.steps or self.cubature else 1.0
         loss = solution.problem.horizon / duration * (weight * entropy).sum(-1)
         mask = points["mask"][: self.points] if "mask" in points.keys() else torch.ones_like(loss, dtype=torch.bool)

@@ -34,6 +34,11 @@ class Sum(ActorRule):
         """Whether all rules can be compiled as one function."""
         return all(rule.compiles_whole for rule in self.rules)
 
+    @property
+    def trains_choices(self) -> bool:  # type: ignore[override]
+        """Whether all rules can train an actor that chooses among numbers."""
+        return all(rule.trains_choices for rule in self.rules)
+
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
         first, *others = (rule(solution, replay, points) for rule in self.rules)
         return sum(others, first)
