@@ -540,6 +540,12 @@ def test_a_grid_has_no_network_to_prove():
         prove_success(GridSolver(Reach1D(), 11, estimate=False).solve(), "none")
 
 
+def test_a_policy_that_jumps_is_refused():
+    problem = Reach1D()
+    with pytest.raises(ProofError, match=r"expected a continuous policy, .* chooses among 3 numbers"):
+        prove_success(Stand(problem, Actor(problem, choices=3)), "none")
+
+
 def test_a_side_in_the_target_is_moved_outward():
     mesh = mesh_of(Ends(Exit1D(), success=True), 10, 10)
     assert mesh.edges[1][0] == -1

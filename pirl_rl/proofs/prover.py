@@ -102,10 +102,16 @@ def prove_success(solution: Solution, networks: str, settings: Settings | None =
         settings: the effort.
 
     Raises:
-        ProofError: there are no networks, too many states or periodic ones, or a function has no enclosure.
+        ProofError: there are no networks, an actor that chooses among numbers, too many states or periodic ones, or a
+            function has no enclosure.
     """
     if not hasattr(solution, "actor"):
         raise ProofError("proof: expected a policy that is a network, got that of a grid")
+    if choice := getattr(solution.actor, "choice", None):
+        raise ProofError(
+            "proof: expected a continuous policy, as with actor.choices=null, got one that chooses among "
+            f"{choice.choices} numbers"
+        )
     _check(solution.problem)
     policy = _policy(solution)
 
