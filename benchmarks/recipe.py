@@ -11,6 +11,7 @@ import json
 import sys
 from pathlib import Path
 
+from pirl_rl.commands.suite import DEFAULTS
 from pirl_rl.commands.suite import main as suite
 
 STATES = "collector.initial_states"
@@ -56,8 +57,8 @@ def main() -> None:
 
 
 def _cell(folder: Path, seeds: list[str]) -> str:
-    files = [path for seed in seeds for path in (folder / seed).glob("score-*.json")]
-    scores = [json.loads(path.read_text(encoding="utf-8")) for path in files]
+    file = f"score-{DEFAULTS['states']}-{DEFAULTS['rollouts']}.json"
+    scores = [json.loads((folder / seed / file).read_text(encoding="utf-8")) for seed in seeds]
     mse, loss = (sum(score[key] for score in scores) / len(scores) for key in ("mse", "loss"))
     return f"{mse:.1e}, {loss:.4f}"
 
