@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
+from pirl_rl.actor_rules.best_control import LEVELS
 from pirl_rl.building import convert, resolve
 from pirl_rl.errors import ArgumentError, ConfigError
 from pirl_rl.problem import ReachAvoidProblem
@@ -30,9 +31,6 @@ BASE_COST, MOST_COST = 80, 1_700_000
 
 The number of updates that is chosen, times this sum, is at most MOST_COST.
 """
-
-CHOICES = 5
-"""The number of values of each coordinate of the control among which an actor chooses."""
 
 PATHS = {
     ("success", "episodes"): (10_000, 1_000),
@@ -91,19 +89,26 @@ def choose_choices(config: DictConfig, problem: ReachAvoidProblem, trust: Sequen
     """Replace `auto` in actor.choices by a number where the noise depends on the control, else by None.
 
     Where noise grows with |u|, the worst control lies between two good ones, and a continuous policy that changes from
-    one to the other passes through it. An actor rule that needs the gradient of the policy has no choices either.
+    one to the other passes through it. Where a rule of the run, or of one of its stages, needs the gradient of the
+    policy, there are no choices either.
 
     Args:
         config: the configuration of a run.
         problem: the physics.
-        trust: modules outside the package that may hold the actor rule.
+        trust: modules outside the package that may hold an actor rule.
     """
     if not isinstance(config.actor, DictConfig) or config.actor.get("choices") != AUTO:
         return
-    key = "loss.actor_rule._target_"
+    stages = config.get("stages")
+    own = [f"stages[{i}].actor_rule" for i in range(len(stages) if isinstance(stages, ListConfig) else 0)]
+    rules = ["loss.actor_rule", *(key for key in own if OmegaConf.select(config, key) is not None)]
+    trains = all(_trains_choices(config, f"{key}._target_", trust) for key in rules)
+    config.actor.choices = LEVELS if trains and has_controlled_noise(problem) else None
+
+
+def _trains_choices(config: DictConfig, key: str, trust: Sequence[str]) -> bool:
     target = OmegaConf.select(config, key)
-    trains = target is not None and getattr(resolve(target, key, trust), "trains_choices", None) is True
-    config.actor.choices = CHOICES if trains and has_controlled_noise(problem) else None
+    return target is not None and getattr(resolve(target, key, trust), "trains_choices", None) is True
 
 
 def choose_paths(config: DictConfig, problem: ReachAvoidProblem, simulator: Simulator) -> None:

@@ -224,11 +224,15 @@ def test_more_controls_take_fewer_points():
 
 
 def test_where_candidates_are_simulated_the_points_are_fewer():
-    """With three controls and five levels, each point needs 15 cubatures of four points, or 15 paths of two steps."""
+    """With three controls and five levels, each point needs 15 cubatures of four points, or 15 paths of two steps.
+
+    With seven levels, the choices of an actor for example, it needs 21 cubatures.
+    """
     problem = Steered(controlled=True)
     simulator = Simulator(problem, 0.1)
-    assert BestControl(problem, simulator, budget=10 * 60 + 59).points == 10
-    assert BestControl(problem, simulator, steps=2, budget=10 * 30 + 29).points == 10
+    assert BestControl(problem, simulator, budget=10 * 60 + 59).most_points(controls=3, levels=5) == 10
+    assert BestControl(problem, simulator, budget=10 * 84 + 83).most_points(controls=3, levels=7) == 10
+    assert BestControl(problem, simulator, steps=2, budget=10 * 30 + 29).most_points(controls=3, levels=5) == 10
 
 
 @pytest.mark.parametrize("controlled", [False, True])
@@ -298,6 +302,8 @@ def test_the_rule_raises_the_score_of_the_best_choice():
         (True, ["actor.choices=null"], None),
         (True, ["pirl.actor_rule._target_=pirl_rl.actor_rules.Hamiltonian"], None),
         (True, ["method=td3"], None),
+        (True, ["stages=[{share:1},{share:1,actor_rule:{_target_:pirl_rl.actor_rules.BestControl}}]"], 5),
+        (True, ["stages=[{share:1},{share:1,actor_rule:{_target_:pirl_rl.actor_rules.Hamiltonian}}]"], None),
     ],
 )
 def test_the_actor_chooses_where_the_noise_depends_on_the_control(controlled, typed, choices):

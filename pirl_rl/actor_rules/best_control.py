@@ -19,6 +19,9 @@ from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 from pirl_rl.structure import has_controlled_noise, is_control_affine, noise_channels
 
+LEVELS = 5
+"""The number of levels of each coordinate of the control where two, its bounds, do not hold the best one."""
+
 
 class BestControl(ActorRule):
     """The negative mean of T sum_i w_i CE((1 + a_i)/2, (1 + pi_i)/2) over points, Eq. (best_control).
@@ -76,7 +79,7 @@ class BestControl(ActorRule):
         inertia: float = 0.1,
     ):
         if levels is None:
-            levels = 2 if steps == 0 and is_control_affine(problem) else 5
+            levels = 2 if steps == 0 and is_control_affine(problem) else LEVELS
         if steps < 0 or levels < 2 or budget < 1 or inertia < 0:
             raise ArgumentError(
                 "actor_rule: expected steps >= 0, levels >= 2, budget >= 1 and inertia >= 0, "
@@ -84,20 +87,21 @@ class BestControl(ActorRule):
             )
         self.simulator, self.steps, self.levels, self.inertia = simulator, steps, levels, inertia
         self.controlled_noise, self.compiles_whole = has_controlled_noise(problem), steps == 0
-        channels, controls = noise_channels(problem), problem.controls.dim
-        self.cubature = steps == 0 and self.controlled_noise and channels * controls <= 64
-        simulated = steps or (2 * channels if self.cubature else 0)
-        self.points = max(1, budget // (controls * max(1, levels * simulated)))
+        channels, self.budget = noise_channels(problem), budget
+        self.cubature = steps == 0 and self.controlled_noise and channels * problem.controls.dim <= 64
+        self.simulated = steps or (2 * channels if self.cubature else 0)
         self.flow: Flow = simulator.flow
 
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
-        tau, x = points["tau"][: self.points], points["state"][: self.points]
         actor, choice = solution.actor, solution.actor.choice
+        number = choice.choices if choice else self.levels
+        most = self.most_points(solution.problem.controls.dim, number)
+        tau, x = points["tau"][:most], points["state"][:most]
         logits = actor.logits(tau, x)
         with torch.no_grad():
             action = actor.layers[-1](logits)
             objective = self._objective(solution, tau.squeeze(-1), x)
-            levels = torch.linspace(-1, 1, choice.choices if choice else self.levels).to(action)
+            levels = torch.linspace(-1, 1, number).to(action)
             best, weight = improved(objective, action, levels, self.inertia)
         if choice:
             scores = logits.unflatten(-1, (-1, choice.choices))
@@ -107,8 +111,12 @@ class BestControl(ActorRule):
             entropy = torch.nn.functional.binary_cross_entropy_with_logits(2 * logits, (1 + best) / 2, reduction="none")
         duration = self.simulator.dt if self.steps or self.cubature else 1.0
         loss = solution.problem.horizon / duration * (weight * entropy).sum(-1)
-        mask = points["mask"][: self.points] if "mask" in points.keys() else torch.ones_like(loss, dtype=torch.bool)
+        mask = points["mask"][:most] if "mask" in points.keys() else torch.ones_like(loss, dtype=torch.bool)
         return -masked_mean(loss, mask)
+
+    def most_points(self, controls: int, levels: int) -> int:
+        """The largest number of points that the budget allows, with so many controls and levels of each."""
+        return max(1, self.budget // (controls * max(1, levels * self.simulated)))
 
     def _objective(self, solution: Solution, tau: Tensor, x: Tensor) -> Objective:
         if self.steps:
