@@ -100,13 +100,14 @@ def choose_choices(config: DictConfig, problem: ReachAvoidProblem, trust: Sequen
     if not isinstance(config.actor, DictConfig) or config.actor.get("choices") != AUTO:
         return
     stages = config.get("stages")
-    own = [f"stages[{i}].actor_rule" for i in range(len(stages) if isinstance(stages, ListConfig) else 0)]
-    rules = ["loss.actor_rule", *(key for key in own if OmegaConf.select(config, key) is not None)]
+    of_stages = [f"stages[{i}].actor_rule" for i in range(len(stages) if isinstance(stages, ListConfig) else 0)]
+    rules = ["loss.actor_rule", *(key for key in of_stages if OmegaConf.select(config, key) is not None)]
     trains = all(_trains_choices(config, f"{key}._target_", trust) for key in rules)
     config.actor.choices = LEVELS if trains and has_controlled_noise(problem) else None
 
 
 def _trains_choices(config: DictConfig, key: str, trust: Sequence[str]) -> bool:
+    """Whether the class of an actor rule says that it trains choices; `Sum` knows that only of the rules it holds."""
     target = OmegaConf.select(config, key)
     return target is not None and getattr(resolve(target, key, trust), "trains_choices", None) is True
 

@@ -185,7 +185,7 @@ def test_alternatives_stand_in_the_table_and_are_kept(tmp_path, capsys, monkeypa
     main([*asked, "against=[grid,lqr]"])
     table = (tmp_path / "runs/suite/suite.md").read_text().splitlines()
     assert table[0].endswith("| Time of the grid | Success of LQR |")
-    found = json.loads((tmp_path / "runs/suite/double_integrator/lqr-30-10.json").read_text())
+    found = json.loads((tmp_path / "runs/suite/double_integrator/lqr-30-10-10.json").read_text())
     assert table[2].endswith(f"| {found['success']:.3f} |")
     assert 0 < found["success"] <= 1
     assert re.search(r"\| \d+\.\d s \|", table[2])

@@ -175,8 +175,7 @@ def _alternative(
 
     The grid is timed anew, because its goal is the error of the worst run, which changes with the seeds.
     """
-    trains = f"-{options['patience']:g}" if other in ("ppo", "sac") else ""
-    path = folder / f"{other}-{len(truth.x)}-{options['rollouts']}{trains}.json"
+    path = folder / f"{other}-{len(truth.x)}-{options['rollouts']}-{options['patience']:g}.json"
     if path.is_file() and other != "grid":
         found = json.loads(path.read_text(encoding="utf-8"))
         return None if found is None else Alternative(**found)
