@@ -294,10 +294,16 @@ def test_a_fault_is_named_with_its_method_and_place(faulty, level, part, message
     ), report(examine(faulty()))
 
 
-SUITE = [getattr(problems, name) for name in problems.__all__]
+LONG = ("VehicleDrift", "VehicleDrift3")
+"""Problems whose check takes long; the vehicle's physics have tests of their own."""
+
+SUITE = [
+    pytest.param(getattr(problems, name), id=name, marks=[pytest.mark.slow] * (name in LONG))
+    for name in problems.__all__
+]
 
 
-@pytest.mark.parametrize("problem", SUITE, ids=[problem.__name__ for problem in SUITE])
+@pytest.mark.parametrize("problem", SUITE)
 def test_the_suite_gives_no_alarm(problem):
     assert report(examine(problem()), ["error", "warning"]) == ""
 

@@ -113,6 +113,7 @@ def test_training_follows_the_critics_and_resumes_bit_for_bit(tmp_path):
     assert_same(whole.learner.loss.state_dict(), rest.learner.loss.state_dict())
 
 
+@pytest.mark.slow
 def test_workers_take_the_noise_out_too(tmp_path):
     trainer = small_trainer(
         tmp_path,

@@ -11,7 +11,7 @@ from torch import Tensor
 from pirl_rl import Box, ReachAvoidProblem
 from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.monte_carlo import monte_carlo
-from pirl_rl.grid import GridSolver
+from pirl_rl.grid import GridSolution, GridSolver
 from pirl_rl.problems import CartPole, DoubleIntegrator, DubinsCar, Exit1D, HalfSpace, RadialExit, Reach1D, Safety1D
 
 
@@ -294,19 +294,22 @@ def test_drift_and_noise_act_in_turns_where_the_noise_is_weak(problem, split):
     assert GridSolver(problem, points=11, estimate=False).solve().split == split
 
 
-def test_the_dubins_car_agrees_with_monte_carlo_of_its_own_policy():
+@pytest.fixture(scope="module")
+def dubins() -> GridSolution:
+    return GridSolver(DubinsCar(), points=41, estimate=False).solve()
+
+
+def test_the_dubins_car_agrees_with_monte_carlo_of_its_own_policy(dubins):
     """With 400 paths from each of 100 states a perfect V would have about 0.008."""
-    problem = DubinsCar()
-    solution = GridSolver(problem, points=41, estimate=False).solve()
+    problem, solution = dubins.problem, dubins
     tau, x = (values[:100] for values in points(problem))
     played = monte_carlo(problem, solution.policy, tau, x, rollouts=400, dt=0.02)
     assert (solution.value(tau, x) - played.probability).abs().mean() < 0.035
 
 
-def test_v_rises_from_a_wall_that_paths_leave():
+def test_v_rises_from_a_wall_that_paths_leave(dubins):
     """Next to a wall V changes within a layer that is far thinner than a cell, as 1 - exp(-2 v d/sigma^2) at d."""
-    problem = DubinsCar()
-    solution = GridSolver(problem, points=41, estimate=False).solve()
+    problem, solution = dubins.problem, dubins
     distance = torch.tensor([0.0034, 0.01, 0.05, 0.1], dtype=torch.float64)
     away = torch.stack([distance - problem.wall, 0 * distance, 0 * distance], -1)
     tau = torch.full((4,), 4.0, dtype=torch.float64)

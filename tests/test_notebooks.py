@@ -31,8 +31,8 @@ SHORT = {
     "'evaluation.during': [], 'evaluation.final': ['success', 'verdict'], 'evaluation.success.episodes': 1_000, "
     "'evaluation.verdict.points': 40, 'evaluation.verdict.rollouts': 8}",
 }
-TRAINING_LONG = ("01_quickstart", "03_schedules")
-"""Notebooks that take more than a minute; the examples of the README and of the docs, which are like them, do not."""
+TRAINING_LONG = ("01_quickstart", "03_schedules", "04_evidence")
+"""Notebooks that train for long; the examples of the README and of the docs, which are like them, do not."""
 
 LIMITS = {
     "01_quickstart": {"max": 0.15},

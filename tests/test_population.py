@@ -53,9 +53,10 @@ def assert_equal(ones: list[Trainer], others: list[Trainer], tolerance: float) -
     "settings",
     [
         pytest.param((), id="default"),
-        pytest.param(PHYSICS, id="physics"),
-        *(pytest.param(TD3, id="td3", marks=pytest.mark.slow), pytest.param(PAPER, id="paper", marks=pytest.mark.slow)),
-        pytest.param(PROBES, id="probes"),
+        *(
+            pytest.param(other, id=name, marks=pytest.mark.slow)
+            for name, other in (("physics", PHYSICS), ("td3", TD3), ("paper", PAPER), ("probes", PROBES))
+        ),
     ],
 )
 def test_members_equal_runs_of_their_own(settings, tmp_path):

@@ -173,7 +173,7 @@ def test_progress_shows_figures_without_a_terminal(tmp_path, capfd):
     assert "update 3/20: train_td_loss" in capfd.readouterr().err
 
 
-@pytest.mark.parametrize("compile", ["false", "true"])
+@pytest.mark.parametrize("compile", ["false", pytest.param("true", marks=pytest.mark.slow)])
 def test_an_update_is_a_step_of_the_optimiser_along_the_gradient_of_backward(compile, tmp_path):
     """Gradients are in the memory order of their parameters, which fused optimisers take for granted."""
     trainer = small_trainer(tmp_path, *PHYSICS, f"compile={compile}")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from functools import cached_property
+
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
@@ -14,7 +17,6 @@ class Player:
     """Plays batches of steps of one environment with the current parameters of a policy.
 
     Attributes:
-        collector: TorchRL's collector, which holds the paths that go on.
         transitions: turns a batch of steps into transitions.
 
     Args:
@@ -32,17 +34,30 @@ class Player:
         self, env: ReachAvoidEnv, policy: PlayedPolicy, frames_per_batch: int, random_frames: int, n_steps: int
     ):
         self.env, self.policy = env, policy
-        self.collector = Collector(
-            env,
-            policy,
-            frames_per_batch=frames_per_batch,
+        self.frames_per_batch, self.random_frames = frames_per_batch, random_frames
+        self.transitions = Transitions(n_steps)
+
+    @cached_property
+    def collector(self) -> Collector:
+        """TorchRL's collector, which holds the paths that go on.
+
+        It plays the policy once as it is made, which compiles it. A training that is refused for one of its settings
+        need not wait for that.
+        """
+        frames = self.frames_per_batch
+        return Collector(
+            self.env,
+            self.policy,
+            frames_per_batch=frames,
             total_frames=-1,
-            init_random_frames=-(-random_frames // frames_per_batch) * frames_per_batch,
+            init_random_frames=-(-self.random_frames // frames) * frames,
             track_traj_ids=False,
             auto_register_policy_transforms=False,
         )
-        self._batches = iter(self.collector)
-        self.transitions = Transitions(n_steps)
+
+    @cached_property
+    def _batches(self) -> Iterator[TensorDictBase]:
+        return iter(self.collector)
 
     def settle(self, initial_states: InitialStates, n_steps: int, exploration_noise: float) -> None:
         """Play with other settings from the next batch on, see `TransitionCollector.play`."""
@@ -56,3 +71,8 @@ class Player:
     def count(self, frames: int) -> None:
         """Set the number of steps played so far, which decides whether the next ones have random actions."""
         self.collector.load_state_dict({**self.collector.state_dict(), "frames": frames})  # type: ignore[arg-type]
+
+    def close(self) -> None:
+        """Stop playing."""
+        if "collector" in vars(self):
+            self.collector.shutdown()

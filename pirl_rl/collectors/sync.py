@@ -95,7 +95,7 @@ class SyncCollector:
         self.start()  # a stage may have emptied the buffer
 
     def close(self) -> None:
-        self._player.collector.shutdown()
+        self._player.close()
 
     def state_dict(self) -> dict[str, Any]:
         return {
