@@ -14,6 +14,12 @@ from pirl_rl.problem import ReachAvoidProblem
 ROUNDING = 1e-9
 """The relative difference from an affine drift, in double precision, that counts as rounding."""
 
+LEVELS, LEVELS_OF_HEADINGS = 5, 33
+"""The numbers of levels of a control where two, its bounds, do not hold the best one, and where it is a heading."""
+
+SAME_CONTROL = 0.01
+"""How much the physics may differ at two bounds that are one control, as a share of their change between the bounds."""
+
 PERIOD_POINTS = 1_000
 """The number of states at which both ends of a period are compared."""
 
@@ -50,6 +56,45 @@ def is_control_affine(problem: ReachAvoidProblem, points: int = 256, seed: int =
     expected = (1 - share) * problem.drift(x, one) + share * problem.drift(x, other)
     gap = (problem.drift(x, (1 - share) * one + share * other) - expected).abs()
     return bool((gap <= ROUNDING * expected.abs().amax(0)).all()) and not has_controlled_noise(problem, points, seed)
+
+
+def closed_controls(problem: ReachAvoidProblem, points: int = 256, seed: int = 0) -> list[int]:
+    """The coordinates of the control whose two bounds are one control, such as a heading from -pi to pi.
+
+    Drift and sigma then are the same at both bounds, and elsewhere others, judged at random states and controls.
+
+    Args:
+        problem: the physics.
+        points: the number of states and controls.
+        seed: of the points.
+    """
+    rng = torch.Generator().manual_seed(seed)
+    x = problem.states.sample(points, rng, torch.float64)
+    action = 2 * torch.rand(points, problem.controls.dim, generator=rng, dtype=torch.float64) - 1
+
+    def physics(action: torch.Tensor) -> torch.Tensor:
+        u = problem.controls.denormalize(action)
+        return torch.cat([problem.drift(x, u), problem.diffusion(x, u).flatten(1)], -1)
+
+    found = []
+    for coordinate in range(problem.controls.dim):
+        low, high = action.clone(), action.clone()
+        low[:, coordinate], high[:, coordinate] = -1, 1
+        largest = (physics(action) - physics(low)).abs().amax(0)
+        if largest.any() and ((physics(high) - physics(low)).abs().amax(0) <= SAME_CONTROL * largest).all():
+            found.append(coordinate)
+    return found
+
+
+def control_levels(problem: ReachAvoidProblem) -> int:
+    """The number of levels of each coordinate of the control, bounds included, one of which is nearly the best.
+
+    Where the Hamiltonian is affine in u, it has its maximum at the bounds. Else the maximum may lie between them, and
+    where a coordinate is a heading, it may lie anywhere.
+    """
+    if closed_controls(problem):
+        return LEVELS_OF_HEADINGS
+    return 2 if is_control_affine(problem) else LEVELS
 
 
 def check_problem(problem: ReachAvoidProblem, points: int = 100_000, seed: int = 0) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 
 import pytest
 import torch
@@ -17,10 +18,10 @@ from pirl_rl.automatic import choose_choices
 from pirl_rl.commands.composition import compose
 from pirl_rl.errors import ArgumentError, ConfigError
 from pirl_rl.networks import Actor, Critic, stack
-from pirl_rl.problems import Reach1D
+from pirl_rl.problems import PlanarQuadrotor, Reach1D, VehicleDrift
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
-from pirl_rl.structure import has_controlled_noise
+from pirl_rl.structure import control_levels, has_controlled_noise
 
 
 class Steered(ReachAvoidProblem):
@@ -44,6 +45,15 @@ class Steered(ReachAvoidProblem):
 
     def target_level(self, x: Tensor) -> Tensor:
         return self.edge - x[..., 0]
+
+
+class Heading(Steered):
+    """dX = (cos u_1, sin u_1) dt + sigma dW: the first control is the heading, all around."""
+
+    controls = Box([-math.pi, 0.0, 0.0], [math.pi, 1.0, 1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.stack([u[..., 0].cos(), u[..., 0].sin()], -1)
 
 
 def solution_of(problem: ReachAvoidProblem, seed: int = 0) -> Solution:
@@ -294,6 +304,20 @@ def test_the_rule_raises_the_score_of_the_best_choice():
 
 
 @pytest.mark.parametrize(
+    ("problem", "levels"),
+    [
+        *((Steered(), 2), (PlanarQuadrotor(), 2)),  # the Hamiltonian is affine in u
+        *((Steered(controlled=True), 5), (VehicleDrift(), 5), (Heading(), 33)),
+    ],
+    ids=["affine", "six states", "noise", "tyres", "heading"],
+)
+def test_levels_of_a_control(problem, levels):
+    assert control_levels(problem) == levels
+    assert BestControl(problem, Simulator(problem)).levels == levels
+    assert BestControl(problem, Simulator(problem), steps=1).levels == max(5, levels)
+
+
+@pytest.mark.parametrize(
     ("controlled", "typed", "choices"),
     [
         (False, [], None),
@@ -310,6 +334,12 @@ def test_the_actor_chooses_where_the_noise_depends_on_the_control(controlled, ty
     config = compose("train", ["+experiment=reach1d", *typed])
     choose_choices(config, Steered(controlled))
     assert config.actor.choices == choices
+
+
+def test_the_actor_chooses_a_heading():
+    config = compose("train", ["+experiment=reach1d"])
+    choose_choices(config, Heading())
+    assert config.actor.choices == 33
 
 
 def test_a_rule_that_needs_the_gradient_of_the_policy_refuses_choices():

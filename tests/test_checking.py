@@ -9,7 +9,7 @@ import torch
 
 import pirl_rl
 import pirl_rl.errors
-from benchmarks.own_problems import Orbit
+from benchmarks.kinds import Orbit
 from pirl_rl import Box, Plane, problems
 from pirl_rl.checking import examine, report
 from pirl_rl.commands.check import main

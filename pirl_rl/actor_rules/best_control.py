@@ -17,10 +17,7 @@ from pirl_rl.operators import masked_mean
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
-from pirl_rl.structure import has_controlled_noise, is_control_affine, noise_channels
-
-LEVELS = 5
-"""The number of levels of each coordinate of the control where two, its bounds, do not hold the best one."""
+from pirl_rl.structure import LEVELS, control_levels, has_controlled_noise, noise_channels
 
 
 class BestControl(ActorRule):
@@ -52,8 +49,8 @@ class BestControl(ActorRule):
         simulator: simulates the control steps.
         steps: the number of control steps ahead; 0 takes the Hamiltonian.
         levels: the number of levels of each coordinate of the control among the candidates, bounds included; at least
-            2. None takes two where the Hamiltonian is affine in u, so that they hold its maximum, and else five. An
-            actor that chooses among numbers has its own.
+            2. None takes that of `pirl_rl.structure.control_levels`, and at least five for a look ahead, which is not
+            affine in u. An actor that chooses among numbers has its own.
         budget: the largest number of points times controls; of more points the first are taken, so that an update of
             the actor does not cost more with more controls. Where candidates are simulated, it is the largest number of
             simulated states. Each level of each control at each point then needs `steps` of them for a look ahead, and
@@ -79,7 +76,7 @@ class BestControl(ActorRule):
         inertia: float = 0.1,
     ):
         if levels is None:
-            levels = 2 if steps == 0 and is_control_affine(problem) else LEVELS
+            levels = max(LEVELS if steps else 2, control_levels(problem))
         if steps < 0 or levels < 2 or budget < 1 or inertia < 0:
             raise ArgumentError(
                 "actor_rule: expected steps >= 0, levels >= 2, budget >= 1 and inertia >= 0, "

@@ -20,6 +20,7 @@ from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.initial_states import InitialStates, UniformStates
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
+from pirl_rl.structure import control_levels
 
 FINER = 2
 """The shorter control step is this part of that of the training."""
@@ -31,7 +32,7 @@ OPEN_LOOP = 8
 """The number of paths of each constant control, and of random ones, from each state."""
 
 LEVELS = 3
-"""The number of levels of each control in the search for a better one."""
+"""The least number of levels of each control in the search for a better one."""
 
 STILL = 1e-3
 """A control whose standard deviation over the states is below this share of its half range does not move."""
@@ -131,9 +132,10 @@ class Verdict:
         u = problem.controls.normalize(solution.policy(tau, x))
         ahead, gain, worst = None, 0.0, 0
         if not isinstance(solution, GridSolution):  # whose policy is the best of its candidates already
-            policy = look_ahead_policy(solution, simulator, 1, LEVELS)
+            levels = max(LEVELS, control_levels(problem))
+            policy = look_ahead_policy(solution, simulator, 1, levels)
             ahead = _difference(play(policy, max(2, self.rollouts // SHARE), few), learned[few])
-            gains = largest_residual(solution, tau, x, along := solution.residual(tau, x), LEVELS) - along
+            gains = largest_residual(solution, tau, x, along := solution.residual(tau, x), levels) - along
             worst = int(gains.argmax())
             gain = gains[worst].item()
         low, high = wilson_interval(learned.mean().item() * self.points * self.rollouts, self.points * self.rollouts)

@@ -25,6 +25,7 @@ from pirl_rl.proofs import LowerBound, Settings, UpperBound, prove_limit, prove_
 from pirl_rl.sampling.initial_states import InitialStates
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
+from pirl_rl.structure import LEVELS, control_levels
 
 Crossing = Literal["bridge", "endpoint"]
 
@@ -69,7 +70,7 @@ class Run:
         """The HJB residual L^pi V (*) in 1/s of the networks under the learned policy, Eq. (linear_pde)."""
         return self._call(self.solution.residual, tau, x)
 
-    def policy(self, tau, x, lookahead: int = 0, levels: int = 5):
+    def policy(self, tau, x, lookahead: int = 0, levels: int | None = None):
         """The control (*, m) in SI units: that of the actor, or one that looks ahead through the model.
 
         Args:
@@ -78,8 +79,10 @@ class Run:
             lookahead: a number of control steps of the training without noise, the first with a candidate control and
                 the others with the actor's. The candidate with the largest V at their end is taken, see
                 `pirl_rl.ascent`; with 0, the actor's control is.
-            levels: each coordinate of the control has this many candidates, evenly spaced over its range.
+            levels: each coordinate of the control has this many candidates, evenly spaced over its range. None takes
+                33 where one of the controls is a heading, and else five.
         """
+        levels = max(LEVELS, control_levels(self.problem)) if levels is None else levels
         if not (isinstance(lookahead, int) and lookahead >= 0 and isinstance(levels, int) and levels >= 2):
             raise ArgumentError(
                 f"policy: expected integers lookahead >= 0 and levels >= 2, got {lookahead!r} and {levels!r}"
