@@ -214,26 +214,6 @@ class VanDerPol(ReachAvoidProblem):
         return 2.4 - x[..., :1].abs()
 
 
-class Crosswind(ReachAvoidProblem):
-    """Bring a drone to rest above a pad, while the wind, a third state without a control, has all of the noise."""
-
-    horizon = 3.0
-    states, controls = Box([-2.0, -2.0, -1.5], [2.0, 2.0, 1.5]), Box([-1.0], [1.0])
-
-    def drift(self, x: Tensor, u: Tensor) -> Tensor:
-        _, v, wind = x.unbind(-1)
-        return rows(v, 1.5 * u[..., 0] - 0.5 * (v - wind), -wind)
-
-    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
-        return constant(x, [0.0], [0.0], [0.8])
-
-    def target_constraints(self, x: Tensor) -> Tensor:
-        return rows(x[..., 0].abs() - 0.3, x[..., 1].abs() - 0.5)
-
-    def avoid_constraints(self, x: Tensor) -> Tensor:
-        return 1.8 - x[..., :1].abs()
-
-
 class TwoHarbours(ReachAvoidProblem):
     """Sail round a shoal into one of two harbours; the control is the heading, with which the speed changes."""
 
@@ -299,6 +279,6 @@ class Loiter(ReachAvoidProblem):
 
 
 KINDS: tuple[type[ReachAvoidProblem], ...] = (Servo, Steering, Evader, Gusty, TwoTanks, Reservoir, Slalom, Orbit, Ring)
-KINDS += (VanDerPol, Crosswind, TwoHarbours, River, Loiter)
+KINDS += (VanDerPol, TwoHarbours, River, Loiter)
 
 PROBLEMS = {kind.__name__: kind for kind in KINDS}

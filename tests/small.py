@@ -22,6 +22,7 @@ from pirl_rl.trainer import Trainer
 # The tests below write the configuration before a trainer chooses the time steps.
 STEPS = ("env.dt=0.1", "env.substeps=1")
 QUICK = ("+experiment=reach1d", "+debug=default", *STEPS, "evaluation.final=[exact]", "evaluation.during=[exact]")
+QUICK += ("figures=false",)
 # A buffer that wraps around, and events that fall on different updates.
 EVENTS = (
     *("env.num_envs=64", "collector.frames_per_batch=128", "collector.updates_per_batch=3", "collector.n_steps=1"),
@@ -34,7 +35,7 @@ PHYSICS = ("recipe=plain", "pirl.final=[1,1,10]", "pirl.critics=2", "pirl.td_cri
 PHYSICS += ("pirl.target_critics=min", "pirl.actor_rule._target_=pirl_rl.actor_rules.Hamiltonian")
 
 TUNED = ("+experiment=reach1d", "+debug=default", *STEPS, "env.num_envs=32", "collector.frames_per_batch=64")
-TUNED += ("collector.warmup_frames=64",)
+TUNED += ("collector.warmup_frames=64", "figures=false")
 DRIFT = ("+experiment=drift", "+debug=drift", "evaluation.during=[]", "evaluation.final=[]")
 
 

@@ -22,7 +22,7 @@ from pirl_rl.assembly import make_trainer
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "docs" / "extensions"
 PAGE = (ROOT / "docs" / "extending.md").read_text()
-SHORT = ("+debug=default", *STEPS, "env.num_envs=64", "trainer.updates=30", "trainer.log_every=1")
+SHORT = ("+debug=default", "figures=false", *STEPS, "env.num_envs=64", "trainer.updates=30", "trainer.log_every=1")
 
 
 @pytest.fixture
@@ -120,7 +120,7 @@ def test_collector(run_of):
 def test_advisor(tmp_path, trained, run_command):
     """The first plan continues from the start with 1.2 times its HJB weight, and its candidate is trained."""
     small = ("+debug=default", *STEPS, "env.num_envs=32", "collector.frames_per_batch=64")
-    small += ("collector.warmup_frames=64",)
+    small += ("collector.warmup_frames=64", "figures=false")
     loop = ("rounds=1", "candidates=1", "updates=10", "out=loop")
     run_command("my_advisor", *small, *loop, RUN_DIR=str(trained))
     [plan] = (tmp_path / "loop").glob("rounds/*/plan.json")

@@ -177,11 +177,11 @@ def test_a_larger_target_never_lowers_the_value():
 
 def test_degenerate_noise_agrees_with_monte_carlo_of_its_own_policy():
     problem = DoubleIntegrator(position_noise=0.0)
-    solution = GridSolver(problem, points=121).solve()
+    solution = GridSolver(problem, points=101).solve()
     tau, x = (values[:100] for values in points(problem))
-    played = monte_carlo(problem, solution.policy, tau, x, rollouts=400, dt=0.01)
+    played = monte_carlo(problem, solution.policy, tau, x, rollouts=200, dt=0.01)
     # Without noise on the position the scheme is of first order, and its error is that of the estimate. The standard
-    # error of one probability is 0.025 at most; that of the mean over 100 states is a tenth of it.
+    # error of one probability is 0.035 at most; that of the mean over 100 states is a tenth of it.
     distance = solution.value(tau, x) - played.probability
     assert abs(distance.mean().item()) < solution.error(tau, x).mean() + 0.01
     assert distance.abs().mean() < solution.error(tau, x).mean() + 0.03

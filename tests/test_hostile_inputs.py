@@ -156,7 +156,7 @@ CALLS = {
     "check with a negative step": (lambda run: pirl_rl.check(ZermeloBoat(), dt=-1), "dt: expected 0 < dt <= horizon"),
 }
 
-SMALL = ("+experiment=reach1d", "+debug=default", "env.dt=0.1", "env.substeps=1")
+SMALL = ("+experiment=reach1d", "+debug=default", "env.dt=0.1", "env.substeps=1", "figures=false")
 
 
 def of_own(name: str, *settings: str) -> tuple[str, ...]:

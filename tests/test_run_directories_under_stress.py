@@ -24,7 +24,7 @@ from pirl_rl.lock import locked
 from pirl_rl.loggers import CSVLogger, read_metrics
 from pirl_rl.run_directory import RunDirectory
 
-RUN = ("+experiment=reach1d", "+debug=default", "env.dt=0.1", "env.substeps=1", "trainer.updates=12")
+RUN = ("+experiment=reach1d", "+debug=default", "env.dt=0.1", "env.substeps=1", "trainer.updates=12", "figures=false")
 RUN += (
     "trainer.evaluate_every=6",
     "trainer.checkpoint_every=4",

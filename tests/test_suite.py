@@ -17,7 +17,7 @@ from pirl_rl.scoring import PROBLEMS, Score, Truth, find_truth, markdown, measur
 from pirl_rl.scoring.truth import DOUBT
 from pirl_rl.simulator import Simulator
 
-SMALL = ["problems=[exit1d]", "states=50", "rollouts=20", "+debug=default", "evaluation.final=[]"]
+SMALL = ["problems=[exit1d]", "states=50", "rollouts=20", "+debug=default", "evaluation.final=[]", "figures=false"]
 SMALL += ["env.dt=0.1", "env.substeps=1", "evaluation.during=[]"]
 
 
