@@ -61,7 +61,8 @@ def is_control_affine(problem: ReachAvoidProblem, points: int = 256, seed: int =
 def closed_controls(problem: ReachAvoidProblem, points: int = 256, seed: int = 0) -> list[int]:
     """The coordinates of the control whose two bounds are one control, such as a heading from -pi to pi.
 
-    Drift and sigma then are the same at both bounds, and elsewhere others, judged at random states and controls.
+    Drift and sigma then are the same at both bounds, and the drift is another one elsewhere, judged at random states
+    and controls.
 
     Args:
         problem: the physics.
@@ -80,8 +81,9 @@ def closed_controls(problem: ReachAvoidProblem, points: int = 256, seed: int = 0
     for coordinate in range(problem.controls.dim):
         low, high = action.clone(), action.clone()
         low[:, coordinate], high[:, coordinate] = -1, 1
-        largest = (physics(action) - physics(low)).abs().amax(0)
-        if largest.any() and ((physics(high) - physics(low)).abs().amax(0) <= SAME_CONTROL * largest).all():
+        between = (physics(action) - physics(low)).abs().amax(0)
+        apart = (physics(high) - physics(low)).abs().amax(0)
+        if between[: problem.states.dim].any() and (apart <= SAME_CONTROL * between).all():
             found.append(coordinate)
     return found
 

@@ -56,6 +56,18 @@ class Heading(Steered):
         return torch.stack([u[..., 0].cos(), u[..., 0].sin()], -1)
 
 
+class Shaken(Steered):
+    """dX = 0.1 X dt + (0.3 + u_1^2) dW: the first control has the same noise at both bounds, and no drift."""
+
+    controls = Box([-1.0, 0.0, 0.0], [1.0, 1.0, 1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return 0.1 * x
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return (0.3 + u[..., 0].square())[..., None, None] * torch.eye(2).to(x)
+
+
 def solution_of(problem: ReachAvoidProblem, seed: int = 0) -> Solution:
     torch.manual_seed(seed)
     return Solution(problem, Actor(problem), stack([Critic(problem, output="Sigmoid")]))
@@ -307,9 +319,9 @@ def test_the_rule_raises_the_score_of_the_best_choice():
     ("problem", "levels"),
     [
         *((Steered(), 2), (PlanarQuadrotor(), 2)),  # the Hamiltonian is affine in u
-        *((Steered(controlled=True), 5), (VehicleDrift(), 5), (Heading(), 33)),
+        *((Steered(controlled=True), 5), (Shaken(), 5), (VehicleDrift(), 5), (Heading(), 33)),
     ],
-    ids=["affine", "six states", "noise", "tyres", "heading"],
+    ids=["affine", "six states", "noise", "noise alone", "tyres", "heading"],
 )
 def test_levels_of_a_control(problem, levels):
     assert control_levels(problem) == levels

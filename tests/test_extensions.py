@@ -50,8 +50,8 @@ def run_command(in_process, monkeypatch):
 def run_of(run_command, tmp_path):
     """`run_of(module)` is the directory of a run of the page's command, and what the command printed."""
 
-    def run(module: str) -> tuple[Path, str]:
-        printed = run_command(module, *SHORT)
+    def run(module: str, *more: str) -> tuple[Path, str]:
+        printed = run_command(module, *SHORT, *more)
         [folder] = (tmp_path / "runs").glob("*/*")
         return folder, printed
 
@@ -99,7 +99,7 @@ def test_schedule(run_of):
 
 
 def test_evaluator(run_of):
-    run, text = run_of("my_evaluator")
+    run, text = run_of("my_evaluator", "figures=true")
     summary = json.loads((run / "summary.json").read_text())
     assert 0 < summary["arrival_share"] < 1
     assert 0 < summary["arrival_time"] <= 2

@@ -19,7 +19,7 @@ from pirl_rl.run_directory import RunDirectory
 from pirl_rl.trainer import Trainer
 
 GUARDED = (
-    *PHYSICS,
+    *(*PHYSICS, "env.crossing=bridge"),
     *("trainer.rollback=true", "evaluation.during=[success]", "evaluation.final=[success]"),
     *("evaluation.success.episodes=1000", "trainer.evaluate_every=10", "trainer.log_every=10"),
     *("trainer.checkpoint_every=25", "trainer.updates=60", "learner.decay=constant", "schedule=constant"),

@@ -224,6 +224,7 @@ def test_resume_writes_nowhere_else(finished, cli, tmp_path):
     precious = tmp_path / "precious"
     precious.write_text("mine")
     link = finished / "figures" / "extra.png"
+    link.parent.mkdir(exist_ok=True)
     link.symlink_to(precious)
     code, text = cli(f"resume={finished}")
     link.unlink()

@@ -49,7 +49,7 @@ def test_command_line(cli, trained, tmp_path):
     code, text = cli(*typed, "seed=4", "advisor.growth=3")
     assert code == 1
     assert "seed, advisor.growth: expected the settings of" in text
-    code, text = cli(*typed[:3], *typed[4:], "rounds=2", "env.num_envs=32", "parallel=2")
+    code, text = cli(*typed[:2], *typed[3:], "rounds=2", "env.num_envs=32", "parallel=2")
     assert code == 1
     code, text = cli(*typed, "rounds=2", "parallel=2")
     assert code == 0, text
