@@ -64,8 +64,7 @@ EXPERIMENTS = [
 def test_every_experiment_trains(experiment, cli, tmp_path, monkeypatch):
     own = ["+debug=drift"] if experiment.startswith("drift") and experiment != "drift3" else ["+debug=default", *SMALL]
     own.append("evaluation.during=[residuals]")  # the others are called at the end
-    drawn = experiment in ("drift", "reach1d")
-    own.append(f"figures={str(drawn).lower()}")
+    own.append("figures=true")
     if experiment == "own":
         (tmp_path / "my_module.py").write_text(OWN.replace("OFFSET", "1.5"))
         sys.modules.pop("my_module", None)
@@ -77,7 +76,7 @@ def test_every_experiment_trains(experiment, cli, tmp_path, monkeypatch):
     summary = json.loads((run / "summary.json").read_text())
     assert summary["updates"] == 20
     assert {"success_rate", "reward", "hjb_sup_loss", "td_loss", "boundary_loss", "calibration_mse"} <= summary.keys()
-    assert (run / "figures" / "training.png").is_file() == drawn
+    assert (run / "figures" / "training.png").is_file()
     opened = load_run(run, trust=("my_module",))
     assert opened.update == 20
     sys.modules.pop("my_module", None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from numbers import Real
 from pathlib import Path
 from typing import Any, Literal
@@ -82,8 +83,8 @@ class Run:
             levels: each coordinate of the control has this many candidates, evenly spaced over its range. None takes
                 33 where one of the controls is a heading, and else five.
         """
-        levels = max(LEVELS, control_levels(self.problem)) if levels is None else levels
-        if not (isinstance(lookahead, int) and lookahead >= 0 and isinstance(levels, int) and levels >= 2):
+        chosen = levels is None or (isinstance(levels, int) and levels >= 2)
+        if not (isinstance(lookahead, int) and lookahead >= 0 and chosen):
             raise ArgumentError(
                 f"policy: expected integers lookahead >= 0 and levels >= 2, got {lookahead!r} and {levels!r}"
             )
@@ -94,7 +95,12 @@ class Run:
             )
         if not lookahead:
             return self._call(self.solution.policy, tau, x)
-        return self._call(look_ahead_policy(self.solution, self.simulator, lookahead, levels), tau, x)
+        return self._call(look_ahead_policy(self.solution, self.simulator, lookahead, levels or self._levels), tau, x)
+
+    @cached_property
+    def _levels(self) -> int:
+        """The number of candidates of each coordinate of the control in a look ahead, which the physics decides."""
+        return max(LEVELS, control_levels(self.problem))
 
     def reach_avoid_set(self, p: float, tau: float) -> Callable:
         """The set {x : V(tau, x) > p}, Eq. (ra_levelset), as a function that maps states (*, n) to (*) bool."""
