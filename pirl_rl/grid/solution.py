@@ -12,8 +12,8 @@ from torch import Tensor
 
 from pirl_rl.errors import ArgumentError, CheckpointError
 from pirl_rl.files import replacing
+from pirl_rl.grid.faces import beyond_the_face
 from pirl_rl.grid.mesh import Mesh, absorbed
-from pirl_rl.grid.transport import after_a_cell
 from pirl_rl.problem import ReachAvoidProblem
 
 ROUNDING = 1e-4
@@ -37,8 +37,7 @@ class GridSolution:
         coarse: the solution with half as many points and steps, or None, and then the error is not known.
         split: whether drift and noise acted in turns, see `pirl_rl.grid.transport`. V is then not extrapolated from
             `coarse`, since its order is not known. In cells that a face cuts it is that at the end of a short path, see
-            `pirl_rl.grid.transport.after_a_cell`: where the noise is weak, V rises from the face within a layer that is
-            thinner than a cell.
+            `pirl_rl.grid.faces`.
     """
 
     def __init__(
@@ -57,6 +56,11 @@ class GridSolution:
 
     dtype, device = torch.float64, torch.device("cpu")
     """The kind of tensors that evaluators pass in, as they do for `pirl_rl.solution.Solution`."""
+
+    @property
+    def steps(self) -> int:
+        """The number of steps in tau."""
+        return len(self._values) - 1
 
     def save(self, path: Path) -> None:
         """Write the solution, without its problem, to one file of numpy arrays.
@@ -201,7 +205,8 @@ class GridSolution:
         if self.split:
             cut = ~self._uncut(x) & self.problem.interior(x)
             spacing = torch.as_tensor(self.mesh.spacing).to(x)
-            fine[cut] = after_a_cell(self.problem, spacing, self.policy, self._interpolated, tau[cut], x[cut])
+            read = self.policy, self._interpolated, lambda x: ~self._uncut(x)
+            fine[cut] = beyond_the_face(self.problem, spacing, *read, tau[cut], x[cut])
             return fine
         if self.coarse is None:
             return fine

@@ -7,6 +7,7 @@ tau is small.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,11 +21,14 @@ from pirl_rl.grid.candidates import candidates
 from pirl_rl.grid.chain import Chain
 from pirl_rl.grid.mesh import Mesh, absorbed, default_margin, make_mesh
 from pirl_rl.grid.solution import GridSolution
-from pirl_rl.grid.transport import Transport, can_split
+from pirl_rl.grid.transport import Transport, is_weak, longest_step
 from pirl_rl.problem import ReachAvoidProblem
 
 POINTS = {1: 401, 2: 121, 3: 51}
 """Default numbers of nodes across `states` along each axis, by the number of states."""
+
+MOST_STEPS = 4
+"""With three states and weak noise there may be up to so many times the default number of steps, see `steps`."""
 
 TOLERANCE = 1e-7
 """The largest error of the equation of one step."""
@@ -43,7 +47,9 @@ class GridSolver:
         problem: the physics, with at most three states.
         points: number of nodes across `problem.states` along each axis, at least 5; one number serves all axes. A part
             of A or B that is thinner than the distance of two nodes may be missed.
-        steps: number of steps in tau, at least 2; the default is the largest number of points.
+        steps: number of steps in tau, at least 2; the default is the largest number of points. With three states and
+            noise that is weak beside the mesh the default is larger where paths would cross more than two cells in a
+            step, since drift and noise can act in turns only with shorter steps, see `pirl_rl.grid.transport`.
         margin: how far the mesh goes beyond `problem.states` on each side, in SI units, one number for each axis. The
             default follows from drift, noise and horizon, see `pirl_rl.grid.mesh.default_margin`.
         levels: number of levels of each control among the candidates, at least 2; the default follows from the
@@ -70,14 +76,13 @@ class GridSolver:
         self.points = (points,) * n if isinstance(points, int) else tuple(points)
         if len(self.points) != n or min(self.points) < 5:
             raise ArgumentError(f"points: expected {n} numbers >= 5, or one, got {points}")
-        self.steps = max(self.points) if steps is None else steps
-        for name, number in (("steps", self.steps), ("levels", levels)):
+        for name, number in (("steps", steps), ("levels", levels)):
             if number is not None and number < 2:
                 raise ArgumentError(f"{name}: expected a number >= 2, got {number}")
         self.margin = default_margin(problem) if margin is None else np.array(margin, float)
         if self.margin.shape != (n,) or not (self.margin >= 0).all():
             raise ArgumentError(f"margin: expected {n} numbers >= 0, got {margin}")
-        self.problem, self.levels, self.estimate = problem, levels, estimate
+        self.problem, self.steps, self.levels, self.estimate = problem, steps, levels, estimate
 
     @torch.no_grad()
     def solve(self) -> GridSolution:
@@ -86,26 +91,33 @@ class GridSolver:
         Raises:
             ArgumentError: no node is outside A and B, or none is next to the target.
         """
-        solution = self._solved(self.points, self.steps)
+        solution = self._solved(self.points)
         if self.estimate:
             half = tuple(max((count + 1) // 2, 3) for count in self.points)
-            solution.coarse = self._solved(half, max(self.steps // 2, 1))
+            # Both have the same scheme, or their distance would not be an estimate of the error.
+            solution.coarse = self._solved(half, (max(solution.steps // 2, 1), solution.split))
         return solution
 
-    def _solved(self, points: Sequence[int], steps: int) -> GridSolution:
+    def _solved(self, points: Sequence[int], scheme: tuple[int, bool] | None = None) -> GridSolution:
+        """The solution without an estimate.
+
+        Args:
+            points: the numbers of nodes across `problem.states` along each axis.
+            scheme: the number of steps, and whether drift and noise act in turns; by default they follow from the
+                problem and the mesh.
+        """
         problem, mesh = self.problem, make_mesh(self.problem, points, self.margin)
         nodes = mesh.states(mesh.indices())
         inside, fixed = absorbed(problem, nodes)
         free = np.flatnonzero(~inside)
         controls = candidates(problem, nodes[free], mesh.spacing, self.levels)
-        # Two states have meshes that are fine enough for the chain, which is monotone.
+        steps, split = self._scheme(mesh, nodes[free], controls) if scheme is None else scheme
         dt = problem.horizon / steps
-        split = len(points) > 2 and can_split(problem, mesh, nodes[free], controls, dt)
         chain = Chain(problem, mesh, free, controls[:1] if split else controls, moves=not split)
         value = problem.boundary_value(torch.from_numpy(nodes[free])).numpy()
         if not (value.any() or any(arm.value.any() for pair in chain.axes for arm in pair)):
             raise ArgumentError(f"points: expected a mesh that meets the target, got none of its nodes with {points}")
-        continued = _Continuation(mesh, free, fixed, chain)
+        continued = _Continuation(mesh, free, fixed, chain, bounded=split)
         values = np.empty((steps + 1, mesh.size), np.float32)
         policies = np.empty((steps + 1, len(free)), np.min_scalar_type(len(controls)))
         shares = np.linspace(0, 1, steps + 1) ** 2
@@ -113,9 +125,9 @@ class GridSolver:
         if split:
             # Equal steps have the same paths; V is noted at the times of all solutions.
             transport = Transport(problem, mesh, nodes[free], controls, dt)
-            after = values[0]
+            after, policy = values[0], np.zeros(len(free), int)
             for step in range(steps):
-                before, (moved, policy) = after, transport(after)
+                before, (moved, policy) = after, transport(after, policy)
                 value = _solve(chain, moved, moved, np.zeros_like(policy), dt)
                 after, within = continued(value), steps * shares - step
                 for level in np.flatnonzero((within > 0) & (within <= 1)):
@@ -132,6 +144,16 @@ class GridSolver:
         around = distance_transform_edt(inside.reshape(mesh.shape), return_distances=False, return_indices=True)
         nearest = place[mesh.flat(np.moveaxis(np.asarray(around), 0, -1)).ravel()]
         return GridSolution(problem, mesh, values, policies, controls, nearest, split=split)
+
+    def _scheme(self, mesh: Mesh, x: np.ndarray, controls: np.ndarray) -> tuple[int, bool]:
+        """The number of steps, and whether drift and noise act in turns, at nodes x (M, n) with controls (K, M, m)."""
+        steps = max(self.points) if self.steps is None else self.steps
+        # Two states have meshes that are fine enough for the chain, which is monotone.
+        if len(self.points) < 3 or not is_weak(self.problem, mesh, x, controls):
+            return steps, False
+        needed = math.ceil(self.problem.horizon / longest_step(self.problem, mesh, x, controls))
+        most = MOST_STEPS * steps if self.steps is None else steps
+        return (max(steps, needed), True) if needed <= most else (steps, False)
 
 
 def _advance(chain: Chain, before: np.ndarray, policy: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
@@ -160,12 +182,16 @@ def _solve(chain: Chain, before: np.ndarray, guess: np.ndarray, policy: np.ndarr
 
 
 class _Continuation:
-    """Continues V linearly from the nodes outside A and B through a face to the next nodes inside."""
+    """Continues V linearly from the nodes outside A and B through a face to the next nodes inside.
 
-    def __init__(self, mesh: Mesh, free: np.ndarray, fixed: np.ndarray, chain: Chain):
+    Interpolation between both then has the value of the set at the face. Where the node outside is very near the face
+    the line may leave [0, 1] by far, and a spline through it oscillates. `bounded` keeps it in [0, 1].
+    """
+
+    def __init__(self, mesh: Mesh, free: np.ndarray, fixed: np.ndarray, chain: Chain, bounded: bool):
         inside = np.ones(mesh.size, bool)
         inside[free] = False
-        self._free, self._fixed, self._arms = free, fixed, []
+        self._free, self._fixed, self._bounded, self._arms = free, fixed, bounded, []
         self._count = np.zeros(mesh.size)
         for arm in (arm for pair in chain.axes for arm in pair):
             ends = np.flatnonzero(arm.cut & inside[arm.node])
@@ -179,4 +205,4 @@ class _Continuation:
             total += np.bincount(node, value[start] + (end - value[start]) / fraction, len(total))
         result = np.where(self._count > 0, total / np.maximum(self._count, 1), self._fixed)
         result[self._free] = value
-        return result
+        return result.clip(0, 1) if self._bounded else result

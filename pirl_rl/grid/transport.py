@@ -10,20 +10,17 @@ a semi-Lagrangian step (M. Falcone and R. Ferretti, Semi-Lagrangian Approximatio
 Equations, SIAM, 2013), where a path that enters A or B on its way has their value. Then the noise acts for the time dt,
 by the chain without drift. Between nodes V is a cubic spline that is limited to the values at the corners of the cell
 (R. Bermejo and A. Staniforth, Monthly Weather Review 120, 1992), so that it stays in [0, 1]. In a cell that a face cuts
-V follows from a short path, see `after_a_cell`.
+V follows from a short path, see `pirl_rl.grid.faces`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import product
 
 import numpy as np
 import torch
-from scipy.ndimage import map_coordinates, spline_filter
-from torch import Tensor
+from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
-from pirl_rl.crossings import passage_probability
 from pirl_rl.grid.mesh import Mesh, absorbed
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.structure import has_controlled_noise
@@ -40,29 +37,33 @@ PADDING = 8
 LOOKS = 2
 """The number of looks for A and B on a path through one cell."""
 
-STEPS_OF_A_CELL = 8
-"""The number of steps in which `after_a_cell` follows a path."""
+BLUR = 1.0
+"""The standard deviation, in cells, of the filter through which candidates see V."""
 
-GAIN = 1e-9
-"""The gain of V by which a candidate must exceed those before it."""
+GAIN = 1e-6
+"""The gain of V for which a node gives up the candidate that it had one step before; V itself is known to 1e-7."""
 
 
-def can_split(problem: ReachAvoidProblem, mesh: Mesh, x: np.ndarray, controls: np.ndarray, dt: float) -> bool:
-    """Whether drift and noise should act in turns of dt, at nodes x (M, n) and with controls (K, M, m).
+def is_weak(problem: ReachAvoidProblem, mesh: Mesh, x: np.ndarray, controls: np.ndarray) -> bool:
+    """Whether the noise is weak beside the mesh at most of the nodes x (M, n), with controls (K, M, m).
 
-    The noise must be weak beside the mesh at most of the nodes, and no path may cross more than `FARTHEST` cells in a
-    turn, during which the control is held. Noise that depends on the control cannot act in a turn of its own.
+    Noise that depends on the control cannot act in a turn of its own, and counts as strong.
     """
     if has_controlled_noise(problem):
         return False
     points, control = torch.from_numpy(x), torch.from_numpy(np.ascontiguousarray(controls[0]))
     variance = (problem.diffusion(points, control).numpy() / mesh.spacing[:, None]) ** 2
     drift = np.abs(problem.drift(points, control).numpy() / mesh.spacing)
-    weak = ((drift > WEAK * variance.sum(-1)).any(-1)).mean() > 0.5
-    farthest = max(
-        np.abs(problem.drift(points, torch.from_numpy(u.copy())).numpy() / mesh.spacing).max() for u in controls
-    )
-    return bool(weak and farthest * dt <= FARTHEST)
+    return bool(((drift > WEAK * variance.sum(-1)).any(-1)).mean() > 0.5)
+
+
+def longest_step(problem: ReachAvoidProblem, mesh: Mesh, x: np.ndarray, controls: np.ndarray) -> float:
+    """The longest step, in s, in which no path from nodes x (M, n) with controls (K, M, m) crosses more than
+    `FARTHEST` cells."""
+    points = torch.from_numpy(x)
+    drifts = (problem.drift(points, torch.from_numpy(np.ascontiguousarray(u))).numpy() for u in controls)
+    fastest = max(np.abs(drift / mesh.spacing).max() for drift in drifts)
+    return FARTHEST / max(fastest, 1e-12)
 
 
 class Transport:
@@ -81,18 +82,32 @@ class Transport:
         points = torch.from_numpy(x)
         self._feet = [_foot(problem, mesh, points, torch.from_numpy(np.ascontiguousarray(u)), dt) for u in controls]
 
-    def __call__(self, field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """W (M,) and the numbers (M,) of the best candidates, from V (N,) at all nodes, continued into A and B."""
+    def __call__(self, field: np.ndarray, policy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """V one step further, and its policy.
+
+        With weak noise V is 1 in whole regions, whatever the next control is, until a path comes to the edge of the
+        region, where the right control must be exact. So candidates are compared by a V that is blurred over a cell,
+        which shows the edge before, and where they are equal a node keeps the control with which V rose there.
+
+        Args:
+            field: V (N,) at all nodes, continued into A and B.
+            policy: the numbers (M,) of the best candidates at a time to go that is one step shorter.
+
+        Returns:
+            W (M,), and the numbers (M,) of the best candidates.
+        """
         padded = self._padded(field)
-        spline = spline_filter(padded, order=3, mode="mirror")
-        value, best = np.array(-np.inf), np.array(0)
+        spline, blurred = spline_filter(padded, order=3, mode="mirror"), gaussian_filter(padded, BLUR, mode="nearest")
+        value, best, seen = np.zeros(len(policy)), policy, np.full(len(policy), -np.inf)
+        kept = np.zeros(len(policy))
         for number, (place, ended, end) in enumerate(self._feet):
             low, high = _corners(padded, place)
             moved = map_coordinates(spline, place, order=3, prefilter=False, mode="nearest").clip(low, high)
-            moved = np.where(ended, end, moved).clip(0, 1)
-            better = moved > value + GAIN
-            value, best = np.where(better, moved, value), np.where(better, number, best)
-        return value, best
+            value = np.maximum(value, np.where(ended, end, moved).clip(0, 1))
+            vague = np.where(ended, end, map_coordinates(blurred, place, order=1, prefilter=False, mode="nearest"))
+            kept = np.where(policy == number, vague, kept)
+            best, seen = np.where(vague > seen, number, best), np.maximum(vague, seen)
+        return value, np.where(seen > kept + GAIN, best, policy)
 
     def _padded(self, field: np.ndarray) -> np.ndarray:
         field = field.reshape(self._mesh.shape)
@@ -101,48 +116,6 @@ class Transport:
             width[axis] = (PADDING, PADDING)
             field = np.pad(field, width, mode="wrap" if axis in self._mesh.periodic else "edge")
         return field
-
-
-def after_a_cell(
-    problem: ReachAvoidProblem,
-    spacing: Tensor,
-    policy: Callable[[Tensor, Tensor], Tensor],
-    value: Callable[[Tensor, Tensor], Tensor],
-    tau: Tensor,
-    x: Tensor,
-) -> Tensor:
-    """V (P,) at states outside A and B, from that where the flow is one cell further.
-
-    On the way the noise may cross a face. Its level is taken as Brownian motion with the drift of the whole way, see
-    `pirl_rl.crossings.passage_probability`. Paths that cross a face of A and one of B count as failures.
-
-    Args:
-        problem: the physics.
-        spacing: the distances (n,) of the nodes, in SI units.
-        policy: gives the controls, in SI units, at tau and x.
-        value: gives V between the nodes, continued into A and B, at tau and x.
-        tau: times to go (P,), in s.
-        x: states (P, n), in SI units.
-    """
-    sets = []
-    if problem.has_avoid_set:
-        sets.append((problem.avoid_constraints, False))
-    if problem.objective == "reach-avoid":
-        sets.append((problem.reached_constraints, True))
-    u = policy(tau, x)
-    rate = problem.drift(x, u).abs() / spacing
-    length = torch.minimum(tau, 1 / rate.amax(-1).clamp(min=1e-12))
-    moved, left, h = x, tau, length / STEPS_OF_A_CELL
-    for _ in range(STEPS_OF_A_CELL):
-        moved = problem.states.wrap(moved + problem.drift(moved, policy(left, moved)) * h.unsqueeze(-1))
-        left = (left - h).clamp(min=0)
-    sigma, under_way, result = problem.diffusion(x, u), torch.ones_like(tau), torch.zeros_like(tau)
-    for constraints, reached in sets:
-        crossed = passage_probability(constraints, x, moved, sigma, length)
-        # All constraints of A must hold, and one of B suffices.
-        ended = under_way * (crossed.amin(-1) if reached else 1 - (1 - crossed).prod(-1))
-        under_way, result = under_way - ended, result + (ended if reached else 0)
-    return result + under_way * value(left, moved)
 
 
 def _foot(problem: ReachAvoidProblem, mesh: Mesh, x: torch.Tensor, u: torch.Tensor, dt: float):
