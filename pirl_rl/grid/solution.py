@@ -21,7 +21,7 @@ ROUNDING = 1e-4
 
 
 class GridSolution:
-    """V and an optimal policy, multilinear in x and linear in sqrt(tau) between the nodes.
+    """V, multilinear in x and linear in sqrt(tau) between the nodes, and an optimal policy.
 
     Beyond the mesh V and the policy are those of the nearest point of its edge. In every method tau is (P,), in s, and
     x is (P, n), in SI units. Results have the dtype and the device of x.
@@ -164,16 +164,22 @@ class GridSolution:
         return value.clamp(0, 1).masked_fill(self.problem.reached(x), 1.0).masked_fill(lost, 0.0)
 
     def policy(self, tau: Tensor, x: Tensor) -> Tensor:
-        """The control (P, m), in SI units.
+        """The control (P, m), in SI units: that of the node with the largest weight in the interpolation of V.
+
+        Controls are not interpolated, since the middle of two good ones may be a bad one, as it is of headings to the
+        left and to the right of an obstacle.
 
         Raises:
             ArgumentError: a tau is outside [0, horizon].
         """
-        result = np.zeros((len(x), self._controls.shape[-1]))
-        for time, node, weight in self._corners(tau, x):
-            place = self._nearest[node]
-            result += weight[:, None] * self._controls[self._policy[time, place], place]
-        return torch.from_numpy(result).to(x)
+        largest, level, node = np.full(len(x), -1.0), np.zeros(len(x), int), np.zeros(len(x), int)
+        for time, corner, weight in self._corners(tau, x):
+            heavier = weight > largest
+            largest, level, node = (
+                np.where(heavier, new, old) for new, old in ((weight, largest), (time, level), (corner, node))
+            )
+        place = self._nearest[node]
+        return torch.from_numpy(self._controls[self._policy[level, place], place]).to(x)
 
     def error(self, tau: Tensor, x: Tensor) -> Tensor:
         """An estimate (P,) of the error: the distance of V from that with half as many points and steps.

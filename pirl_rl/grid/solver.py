@@ -27,8 +27,8 @@ from pirl_rl.problem import ReachAvoidProblem
 POINTS = {1: 401, 2: 121, 3: 51}
 """Default numbers of nodes across `states` along each axis, by the number of states."""
 
-MOST_STEPS = 4
-"""With three states and weak noise there may be up to so many times the default number of steps, see `steps`."""
+MOST_STEPS = 6
+"""The largest number of steps for each of the largest number of points, where it is chosen."""
 
 TOLERANCE = 1e-7
 """The largest error of the equation of one step."""
@@ -48,8 +48,9 @@ class GridSolver:
         points: number of nodes across `problem.states` along each axis, at least 5; one number serves all axes. A part
             of A or B that is thinner than the distance of two nodes may be missed.
         steps: number of steps in tau, at least 2; the default is the largest number of points. With three states and
-            noise that is weak beside the mesh the default is larger where paths would cross more than two cells in a
-            step, since drift and noise can act in turns only with shorter steps, see `pirl_rl.grid.transport`.
+            noise that is weak beside the mesh it is larger, up to `MOST_STEPS` times, where most paths would lead
+            through more than two cells in a step: drift and noise can act in turns only with shorter steps, see
+            `pirl_rl.grid.transport`.
         margin: how far the mesh goes beyond `problem.states` on each side, in SI units, one number for each axis. The
             default follows from drift, noise and horizon, see `pirl_rl.grid.mesh.default_margin`.
         levels: number of levels of each control among the candidates, at least 2; the default follows from the

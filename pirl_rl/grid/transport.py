@@ -15,11 +15,9 @@ V follows from a short path, see `pirl_rl.grid.faces`.
 
 from __future__ import annotations
 
-from itertools import product
-
 import numpy as np
 import torch
-from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
+from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, minimum_filter, spline_filter
 
 from pirl_rl.grid.mesh import Mesh, absorbed
 from pirl_rl.problem import ReachAvoidProblem
@@ -29,7 +27,7 @@ WEAK = 2.0
 """h |f| / sigma^2 along an axis, from which the noise is weak beside the mesh: there the chain is upwind."""
 
 FARTHEST = 2.0
-"""The largest number of cells through which a path goes while its control is held."""
+"""The largest number of cells through which most paths go while their control is held."""
 
 PADDING = 8
 """Nodes by which periodic axes are continued at both ends, where a cubic spline forgets its ends."""
@@ -58,11 +56,14 @@ def is_weak(problem: ReachAvoidProblem, mesh: Mesh, x: np.ndarray, controls: np.
 
 
 def longest_step(problem: ReachAvoidProblem, mesh: Mesh, x: np.ndarray, controls: np.ndarray) -> float:
-    """The longest step, in s, in which no path from nodes x (M, n) with controls (K, M, m) crosses more than
-    `FARTHEST` cells."""
+    """The longest step, in s, in which most paths lead through at most `FARTHEST` cells.
+
+    One in ten of the paths from nodes x (M, n) with controls (K, M, m) may lead through more of them. Otherwise a few
+    states with large forces would make the steps of all too short.
+    """
     points = torch.from_numpy(x)
     drifts = (problem.drift(points, torch.from_numpy(np.ascontiguousarray(u))).numpy() for u in controls)
-    fastest = max(np.abs(drift / mesh.spacing).max() for drift in drifts)
+    fastest = np.quantile([np.abs(drift / mesh.spacing).max(-1) for drift in drifts], 0.9)
     return FARTHEST / max(fastest, 1e-12)
 
 
@@ -98,11 +99,13 @@ class Transport:
         """
         padded = self._padded(field)
         spline, blurred = spline_filter(padded, order=3, mode="mirror"), gaussian_filter(padded, BLUR, mode="nearest")
+        # The smallest and the largest value at the corners of each cell, noted at its first corner.
+        low, high = (extreme(padded, size=2, origin=-1) for extreme in (minimum_filter, maximum_filter))
         value, best, seen = np.zeros(len(policy)), policy, np.full(len(policy), -np.inf)
         kept = np.zeros(len(policy))
         for number, (place, ended, end) in enumerate(self._feet):
-            low, high = _corners(padded, place)
-            moved = map_coordinates(spline, place, order=3, prefilter=False, mode="nearest").clip(low, high)
+            cell = tuple(np.floor(place).astype(int))
+            moved = map_coordinates(spline, place, order=3, prefilter=False, mode="nearest").clip(low[cell], high[cell])
             value = np.maximum(value, np.where(ended, end, moved).clip(0, 1))
             vague = np.where(ended, end, map_coordinates(blurred, place, order=1, prefilter=False, mode="nearest"))
             kept = np.where(policy == number, vague, kept)
@@ -137,13 +140,3 @@ def _foot(problem: ReachAvoidProblem, mesh: Mesh, x: torch.Tensor, u: torch.Tens
     for axis, count in enumerate(mesh.shape):
         place[axis] = place[axis] % count if axis in mesh.periodic else place[axis].clip(0, count - 1)
     return place + PADDING, ended, end
-
-
-def _corners(field: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The smallest and the largest value (M,) at the corners of the cells of positions (n, M)."""
-    base = np.floor(place).astype(int)
-    low, high = np.full(place.shape[1], np.inf), np.full(place.shape[1], -np.inf)
-    for offset in product((0, 1), repeat=len(base)):
-        value = field[tuple(base + np.array(offset)[:, None])]
-        low, high = np.minimum(low, value), np.maximum(high, value)
-    return low, high
