@@ -278,7 +278,27 @@ class Loiter(ReachAvoidProblem):
         return torch.minimum(radius - 0.4, 1.5 - radius)
 
 
+class Crosswind(ReachAvoidProblem):
+    """Bring a mass to rest between two walls in a wind that nobody controls, and which alone has noise."""
+
+    horizon = 2.5
+    states, controls = Box([-1.5, -1.5, -1.0], [1.5, 1.5, 1.0]), Box([-1.0], [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        _, speed, wind = x.unbind(-1)
+        return rows(speed, u[..., 0] + wind, -0.8 * wind)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return constant(x, [0.0], [0.0], [0.5])
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return rows(x[..., 0].abs() - 0.2, x[..., 1].abs() - 0.3)
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        return 1.3 - x[..., :1].abs()
+
+
 KINDS: tuple[type[ReachAvoidProblem], ...] = (Servo, Steering, Evader, Gusty, TwoTanks, Reservoir, Slalom, Orbit, Ring)
-KINDS += (VanDerPol, TwoHarbours, River, Loiter)
+KINDS += (VanDerPol, TwoHarbours, River, Loiter, Crosswind)
 
 PROBLEMS = {kind.__name__: kind for kind in KINDS}

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchmarks.kinds import Crosswind
 from pirl_rl import Box, ReachAvoidProblem
 from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.monte_carlo import monte_carlo
@@ -137,6 +138,16 @@ def test_a_layer_that_is_thinner_than_a_cell_has_its_values_at_the_nodes(wall):
     solution = GridSolver(Driven(wall), points=21, estimate=False).solve()
     exact = 1 - torch.exp(-2 * (nodes[:, 0] - wall) / Driven.variance)
     assert (solution.value(torch.full((18,), 4.0, dtype=torch.float64), nodes) - exact).abs().max() < 0.01
+
+
+def test_the_estimate_sees_a_layer_that_is_thinner_than_a_cell():
+    """At a 20th of a cell from the wall V is 0.22, and linear between the wall and the first node it is 0.05."""
+    x = torch.linspace(0.0025, 0.04, 16, dtype=torch.float64).unsqueeze(-1)
+    solution, tau = GridSolver(Driven(0.0), points=21).solve(), torch.full((16,), 4.0, dtype=torch.float64)
+    exact = 1 - torch.exp(-2 * x[:, 0] / Driven.variance)
+    error = (solution.value(tau, x) - exact).abs()
+    assert error.max() > 0.1
+    assert (error <= solution.error(tau, x)).all()
 
 
 @pytest.mark.parametrize("problem", [RadialExit(dim=2), Skewed()], ids=lambda problem: type(problem).__name__)
@@ -318,26 +329,6 @@ def test_v_rises_from_a_wall_that_paths_leave(dubins):
     assert (value - played.probability).abs().max() < 0.1
     layer = 1 - (-2 * problem.speed * distance / problem.noise[0] ** 2).exp()
     assert (value / value[-1] - layer)[:2].abs().max() < 0.01
-
-
-class Crosswind(ReachAvoidProblem):
-    """Bring a mass to rest between two walls in a wind that nobody controls, and which alone has noise."""
-
-    horizon = 2.5
-    states, controls = Box([-1.5, -1.5, -1.0], [1.5, 1.5, 1.0]), Box([-1.0], [1.0])
-
-    def drift(self, x: Tensor, u: Tensor) -> Tensor:
-        _, speed, wind = x.unbind(-1)
-        return torch.stack([speed, u[..., 0] + wind, -0.8 * wind], -1)
-
-    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
-        return x.new_tensor([[0.0], [0.0], [0.5]]).expand(*x.shape[:-1], 3, 1)
-
-    def target_constraints(self, x: Tensor) -> Tensor:
-        return torch.stack([x[..., 0].abs() - 0.2, x[..., 1].abs() - 0.3], -1)
-
-    def avoid_constraints(self, x: Tensor) -> Tensor:
-        return 1.3 - x[..., :1].abs()
 
 
 def test_noise_two_integrators_away_agrees_with_monte_carlo_of_its_own_policy():
