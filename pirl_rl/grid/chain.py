@@ -17,8 +17,10 @@ backward are fitted to the layer instead (A. Il'in, Mathematical Notes 6, 1969):
     r p - s q = c_k lambda_k,   r (1 - e^(-2 c_k p)) = s (e^(2 c_k q) - 1),
 
 so that they have the same drift, and with constant drift and noise the right probability of reaching the end of one arm
-before that of the other. For large c_k they are upwind differences, of first order. What is left of F along axes with
-little or no noise moves by the rate |R_i| / p for the rest R_i > 0, with p of the arm along R_i.
+before that of the other. For large c_k they are upwind differences, of first order. Along an oblique v_k these would
+add noise across the drift, and so c_k stays between -1/q and 1/p there. Offsets along axes take what these leave. What
+is left of F along axes with little or no noise moves by the rate |R_i| / p for the rest R_i > 0, with p of the arm
+along R_i.
 """
 
 from __future__ import annotations
@@ -42,6 +44,9 @@ BISECTIONS = 12
 
 STEEPEST = 20.0
 """The largest |c_k|, beyond which the drift moves along the axes. After one arm e^-40 is left of such a layer."""
+
+LEAST_WEIGHT = 1e-12
+"""The smallest lambda_k by which a drift is divided."""
 
 SHORTEST = 1e-3
 """The smallest fraction of an arm; it bounds the rates, and moves a face by at most this share of a node distance."""
@@ -167,13 +172,23 @@ class Chain:
         """The rates (M, M) and the gain (M,) of one candidate with its drift (M, n), in units of the mesh per s."""
         jumps, rest = [], drift.copy()
         slope = np.einsum("pij,pj->pi", np.broadcast_to(noise.inverse, (len(drift), *noise.inverse.shape[1:])), drift)
-        for weight, offset, forward, backward in noise.directions:
-            p, q = forward.fraction, backward.fraction
-            share = (offset * slope).sum(-1).clip(-STEEPEST, STEEPEST)
-            fitted = forward.cut | backward.cut | (share > 1 / p) | (share < -1 / q)
-            ahead, back = _jump_rates(share, p, q, fitted)
-            jumps += [(forward, weight * ahead), (backward, weight * back)]
-            rest -= (share * weight)[:, None] * offset
+        # Axes come last, and take what oblique offsets have left.
+        for along_axes in (False, True):
+            for weight, offset, forward, backward in noise.directions:
+                p, q = forward.fraction, backward.fraction
+                here = ((offset != 0).sum(-1) == 1) == along_axes
+                if not here.any():
+                    continue
+                if along_axes:
+                    share = (offset * rest).sum(-1) / np.maximum(weight, LEAST_WEIGHT)
+                else:
+                    share = (offset * slope).sum(-1).clip(-1 / q, 1 / p)
+                share = share.clip(-STEEPEST, STEEPEST)
+                fitted = forward.cut | backward.cut | (share > 1 / p) | (share < -1 / q)
+                ahead, back = _jump_rates(share, p, q, fitted)
+                rate = weight * here
+                jumps += [(forward, rate * ahead), (backward, rate * back)]
+                rest -= (share * rate)[:, None] * offset
         for axis, (forward, backward) in enumerate(self.axes):
             jumps.append((forward, rest[:, axis].clip(0) / forward.fraction))
             jumps.append((backward, (-rest[:, axis]).clip(0) / backward.fraction))
