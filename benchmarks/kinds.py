@@ -298,7 +298,28 @@ class Crosswind(ReachAvoidProblem):
         return 1.3 - x[..., :1].abs()
 
 
+class Bicycle(ReachAvoidProblem):
+    """Park a car that also drives backwards; a steering angle turns it by as much as its speed allows."""
+
+    horizon = 4.0
+    states = Box([-2.0, -2.0, -math.pi], [2.0, 2.0, math.pi], periodic=[2])
+    controls = Box([-0.6, -0.6], [1.0, 0.6])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        speed, angle = u.unbind(-1)
+        return rows(speed * x[..., 2].cos(), speed * x[..., 2].sin(), speed * angle.tan() / 0.5)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return constant(x, [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.15])
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return rows(x[..., 0].abs() - 0.4, x[..., 1].abs() - 0.3, math.cos(0.5) - x[..., 2].cos())
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        return (x[..., :2] - x.new_tensor([0.9, 0.6])).norm(dim=-1) - 0.35
+
+
 KINDS: tuple[type[ReachAvoidProblem], ...] = (Servo, Steering, Evader, Gusty, TwoTanks, Reservoir, Slalom, Orbit, Ring)
-KINDS += (VanDerPol, TwoHarbours, River, Loiter, Crosswind)
+KINDS += (VanDerPol, TwoHarbours, River, Loiter, Crosswind, Bicycle)
 
 PROBLEMS = {kind.__name__: kind for kind in KINDS}
