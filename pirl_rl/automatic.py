@@ -10,7 +10,8 @@ from pirl_rl.building import convert, resolve
 from pirl_rl.errors import ArgumentError, ConfigError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
-from pirl_rl.structure import check_problem, closed_controls, control_levels, has_controlled_noise, noise_channels
+from pirl_rl.structure import check_problem, noise_channels
+from pirl_rl.switching import control_levels, jumps_over_worse_controls
 from pirl_rl.time_steps import check_time_steps, propose_time_steps
 
 AUTO = "auto"
@@ -85,11 +86,10 @@ def choose_updates(config: DictConfig, problem: ReachAvoidProblem) -> None:
 
 
 def choose_choices(config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[str] = ()) -> None:
-    """Replace `auto` in actor.choices by a number where noise depends on the control or one is a heading, else by None.
+    """Replace `auto` in actor.choices by a number where the best control jumps over worse ones, else by None.
 
-    Where noise grows with |u|, the worst control lies between two good ones, and a continuous policy that changes from
-    one to the other passes through it. A heading of pi is one of -pi, and all other headings lie between them. Where a
-    rule of the run, or of one of its stages, needs the gradient of the policy, there are no choices.
+    See `pirl_rl.switching`. Where a rule of the run, or of one of its stages, needs the gradient of the policy, there
+    are no choices.
 
     Args:
         config: the configuration of a run.
@@ -102,8 +102,7 @@ def choose_choices(config: DictConfig, problem: ReachAvoidProblem, trust: Sequen
     of_stages = [f"stages[{i}].actor_rule" for i in range(len(stages) if isinstance(stages, ListConfig) else 0)]
     rules = ["loss.actor_rule", *(key for key in of_stages if OmegaConf.select(config, key) is not None)]
     trains = all(_trains_choices(config, f"{key}._target_", trust) for key in rules)
-    jumps = has_controlled_noise(problem) or closed_controls(problem)
-    config.actor.choices = control_levels(problem) if trains and jumps else None
+    config.actor.choices = control_levels(problem) if trains and jumps_over_worse_controls(problem) else None
 
 
 def _trains_choices(config: DictConfig, key: str, trust: Sequence[str]) -> bool:

@@ -14,12 +14,6 @@ from pirl_rl.problem import ReachAvoidProblem
 ROUNDING = 1e-9
 """The relative difference from an affine drift, in double precision, that counts as rounding."""
 
-LEVELS, LEVELS_OF_HEADINGS = 5, 33
-"""The numbers of levels of a control where two, its bounds, do not hold the best one, and where it is a heading."""
-
-SAME_CONTROL = 0.01
-"""How much the physics may differ at two bounds that are one control, as a share of their change between the bounds."""
-
 PERIOD_POINTS = 1_000
 """The number of states at which both ends of a period are compared."""
 
@@ -83,47 +77,6 @@ def controls_interact(problem: ReachAvoidProblem, points: int = 256, seed: int =
         if ((ends - middles).abs() > ROUNDING * ends.abs().amax(0).clamp(min=ROUNDING)).any():
             return True
     return False
-
-
-def closed_controls(problem: ReachAvoidProblem, points: int = 256, seed: int = 0) -> list[int]:
-    """The coordinates of the control whose two bounds are one control, such as a heading from -pi to pi.
-
-    Drift and sigma then are the same at both bounds, and the drift is another one elsewhere, judged at random states
-    and controls.
-
-    Args:
-        problem: the physics.
-        points: the number of states and controls.
-        seed: of the points.
-    """
-    rng = torch.Generator().manual_seed(seed)
-    x = problem.states.sample(points, rng, torch.float64)
-    action = 2 * torch.rand(points, problem.controls.dim, generator=rng, dtype=torch.float64) - 1
-
-    def physics(action: torch.Tensor) -> torch.Tensor:
-        u = problem.controls.denormalize(action)
-        return torch.cat([problem.drift(x, u), problem.diffusion(x, u).flatten(1)], -1)
-
-    found = []
-    for coordinate in range(problem.controls.dim):
-        low, high = action.clone(), action.clone()
-        low[:, coordinate], high[:, coordinate] = -1, 1
-        between = (physics(action) - physics(low)).abs().amax(0)
-        apart = (physics(high) - physics(low)).abs().amax(0)
-        if between[: problem.states.dim].any() and (apart <= SAME_CONTROL * between).all():
-            found.append(coordinate)
-    return found
-
-
-def control_levels(problem: ReachAvoidProblem) -> int:
-    """The number of levels of each coordinate of the control, bounds included, one of which is nearly the best.
-
-    Where the Hamiltonian is affine in u, it has its maximum at the bounds. Else the maximum may lie between them, and
-    where a coordinate is a heading, it may lie anywhere.
-    """
-    if closed_controls(problem):
-        return LEVELS_OF_HEADINGS
-    return 2 if is_control_affine(problem) else LEVELS
 
 
 def check_problem(problem: ReachAvoidProblem, points: int = 100_000, seed: int = 0) -> None:

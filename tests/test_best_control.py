@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from benchmarks.kinds import Bicycle, Gusty
+from benchmarks.kinds import Bicycle, Gusty, TwoHarbours
 from pirl_rl import Box, ReachAvoidProblem
 from pirl_rl.actor_rules import BestControl, Hamiltonian
 from pirl_rl.ascent import (
@@ -32,7 +32,8 @@ from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.problems import PlanarQuadrotor, Reach1D, VehicleDrift
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
-from pirl_rl.structure import control_levels, controls_interact, has_controlled_noise
+from pirl_rl.structure import controls_interact, has_controlled_noise
+from pirl_rl.switching import COARSE, JUMPS, control_levels, jumps_over_worse_controls, switching
 
 
 class Steered(ReachAvoidProblem):
@@ -366,14 +367,38 @@ def test_the_rule_raises_the_score_of_the_best_choice():
     ("problem", "levels"),
     [
         *((Steered(), 2), (PlanarQuadrotor(), 2)),  # the Hamiltonian is affine in u
-        *((Steered(controlled=True), 5), (Shaken(), 5), (VehicleDrift(), 5), (Heading(), 33)),
+        *((Steered(controlled=True), 5), (Shaken(), 5), (VehicleDrift(), 5), (Bicycle(), 5), (Heading(), 33)),
     ],
-    ids=["affine", "six states", "noise", "noise alone", "tyres", "heading"],
+    ids=["affine", "six states", "noise", "noise alone", "tyres", "bicycle", "heading"],
 )
 def test_levels_of_a_control(problem, levels):
     assert control_levels(problem) == levels
     assert BestControl(problem, Simulator(problem)).levels == levels
     assert BestControl(problem, Simulator(problem), steps=1).levels == max(5, levels)
+
+
+@pytest.mark.parametrize(
+    ("problem", "jumps", "coarse"),
+    [(Steered(), False, False), (VehicleDrift(), False, False), (Bicycle(), True, False), (TwoHarbours(), True, True)],
+    ids=lambda value: type(value).__name__,
+)
+def test_jumps_over_worse_controls(problem, jumps, coarse):
+    """Forwards to the left and backwards to the right are vertices, for which five levels suffice; headings are not."""
+    for seed in range(3):
+        found = switching(problem, seed)
+        assert (found.jumps > JUMPS) == jumps
+        assert (found.coarseness > COARSE) == coarse
+    assert jumps_over_worse_controls(problem) == jumps
+
+
+def test_noise_that_depends_on_the_control_makes_it_jump():
+    assert switching(Gusty()).jumps == 0
+    assert jumps_over_worse_controls(Gusty())
+
+
+def test_the_best_of_an_affine_drift_jumps_over_equals():
+    """At the moment of a jump p . f is constant along the coordinate, so that no control between is worse."""
+    assert switching(Steered()) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize(

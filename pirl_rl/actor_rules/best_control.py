@@ -17,7 +17,8 @@ from pirl_rl.operators import masked_mean
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
-from pirl_rl.structure import LEVELS, control_levels, has_controlled_noise, noise_channels
+from pirl_rl.structure import has_controlled_noise, noise_channels
+from pirl_rl.switching import LEVELS, control_levels
 
 
 class BestControl(ActorRule):
@@ -50,7 +51,7 @@ class BestControl(ActorRule):
         simulator: simulates the control steps.
         steps: the number of control steps ahead; 0 takes the Hamiltonian.
         levels: the number of levels of each coordinate of the control among the candidates, bounds included; at least
-            2. None takes that of `pirl_rl.structure.control_levels`, and at least five for a look ahead, which is not
+            2. None takes that of `pirl_rl.switching.control_levels`, and at least five for a look ahead, which is not
             affine in u. An actor that chooses among numbers has its own.
         budget: the largest number of points times controls; of more points the first are taken, so that an update of
             the actor does not cost more with more controls. Where candidates are simulated, it is the largest number of

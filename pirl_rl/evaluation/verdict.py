@@ -20,7 +20,7 @@ from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.initial_states import InitialStates, UniformStates
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
-from pirl_rl.structure import control_levels
+from pirl_rl.switching import control_levels
 
 FINER = 2
 """The shorter control step is this part of that of the training."""

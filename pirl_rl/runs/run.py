@@ -26,7 +26,7 @@ from pirl_rl.proofs import LowerBound, Settings, UpperBound, prove_limit, prove_
 from pirl_rl.sampling.initial_states import InitialStates
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
-from pirl_rl.structure import LEVELS, control_levels
+from pirl_rl.switching import LEVELS, control_levels
 
 Crossing = Literal["bridge", "endpoint"]
 

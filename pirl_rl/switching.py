@@ -1,0 +1,119 @@
+"""How the best control changes with the direction of grad V, and what follows for the choice of controls.
+
+The control that is best at a state maximises p . f(x, u) for p = grad V. Along a line of directions p it changes, in
+small steps or by jumps. Where the drift is affine in u, all controls between the old and the new one are as good at the
+moment of a jump. Where it is not, those between may be worse. A heading of pi is one of -pi, and all others lie between
+them. To turn a car, forwards to the left is as good as backwards to the right, and to stand still is worse. A policy
+that is continuous in the state passes through these controls; one that chooses among levels jumps over them.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.structure import has_controlled_noise, is_control_affine
+
+LEVELS, FINE_LEVELS = 5, 33
+"""The numbers of levels of a control where two, its bounds, do not hold the best one, and where five are too few."""
+
+JUMPS = 0.25
+"""The share of jumps over worse controls from which a policy should jump."""
+
+COARSE = 0.005
+"""What `LEVELS` may lose against the best control, as a share of the range of p . f, before they are too few."""
+
+POINTS, TURNS = 128, 129
+"""The numbers of states, and of directions p on a line at each of them."""
+
+MARKS = 17
+"""The levels of each control that are compared."""
+
+TOGETHER = 2
+"""The largest number of coordinates of u that change together; the others are drawn at random."""
+
+FAR = 4
+"""The least number of levels in a coordinate that makes a change of the best control a jump."""
+
+WORSE = 0.1
+"""The share of the range of p . f by which the middle of a jump is worse than its end, for the jump to count."""
+
+
+class Switching(NamedTuple):
+    """How the best control changes.
+
+    Attributes:
+        jumps: the share of the jumps that lead over worse controls; 0 where there is no jump.
+        coarseness: the mean of what `LEVELS` levels lose against `MARKS`, as a share of the range of p . f.
+    """
+
+    jumps: float
+    coarseness: float
+
+
+def jumps_over_worse_controls(problem: ReachAvoidProblem) -> bool:
+    """Whether the best control jumps from one good control to another with worse ones between them.
+
+    So it does where sigma depends on u, since the worst control may have the least noise or the most, and where
+    `switching` finds it for the drift.
+    """
+    return has_controlled_noise(problem) or switching(problem).jumps > JUMPS
+
+
+def control_levels(problem: ReachAvoidProblem) -> int:
+    """The number of levels of each coordinate of the control, bounds included, one of which is nearly the best.
+
+    Where the Hamiltonian is affine in u, it has its maximum at the bounds. Else the maximum may lie between them. Where
+    it jumps over worse controls, and may lie anywhere, as that of a heading, few levels would be too coarse for the
+    policy, which takes one of them.
+    """
+    if is_control_affine(problem):
+        return 2
+    found = switching(problem)
+    return FINE_LEVELS if found.jumps > JUMPS and found.coarseness > COARSE else LEVELS
+
+
+def switching(problem: ReachAvoidProblem, seed: int = 0) -> Switching:
+    """How the best control changes along lines of directions p, at random states, for the drift alone.
+
+    Args:
+        problem: the physics.
+        seed: of states, controls and directions.
+    """
+    rng, n = torch.Generator().manual_seed(seed), problem.states.dim
+    x = problem.states.sample(POINTS, rng, torch.float64)
+    levels, action = _trials(problem.controls.dim, rng)
+    y = x[:, None].expand(-1, len(levels), -1)
+    drift = problem.drift(y, problem.controls.denormalize(action)) / problem.states.center_and_half_width(x)[1]
+    one, other = (torch.randn(POINTS, 1, n, generator=rng, dtype=x.dtype) for _ in range(2))
+    share = torch.linspace(0, 1, TURNS, dtype=x.dtype).unsqueeze(-1)
+    score = ((1 - share) * one + share * other) @ drift.mT  # (POINTS, TURNS, K)
+    top, best = score.max(-1)
+    spread = (top - score.amin(-1)).mean(1, keepdim=True).clamp(min=1e-12)
+
+    before, after = levels[best[:, :-1]], levels[best[:, 1:]]
+    jumped = ((before - after).abs() >= FAR).any(-1)
+    base = MARKS ** torch.arange(levels.shape[1] - 1, -1, -1)
+    middle = score[:, 1:].gather(2, (base * ((before + after) // 2)).sum(-1, keepdim=True)).squeeze(-1)
+    worse = jumped & ((top[:, 1:] - middle) / spread > WORSE)
+
+    few = (levels % ((MARKS - 1) // (LEVELS - 1)) == 0).all(-1)
+    lost = (top - score[..., few].amax(-1)) / spread
+    return Switching((worse.sum() / jumped.sum().clamp(min=1)).item(), lost.mean().item())
+
+
+def _trials(m: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
+    """The indices (K, c) of the levels of c coordinates of u, and actions (POINTS, K, m) that have these levels.
+
+    At each point c other coordinates are drawn, and the rest of the action is one random number for each coordinate.
+    """
+    count = min(TOGETHER, m)
+    levels = torch.cartesian_prod(*[torch.arange(MARKS)] * count).reshape(-1, count)
+    marks = torch.linspace(-1, 1, MARKS, dtype=torch.float64)[levels]
+    moved = torch.stack([torch.randperm(m, generator=rng)[:count] for _ in range(POINTS)]).unsqueeze(1)
+    action = 2 * torch.rand(POINTS, 1, m, generator=rng, dtype=marks.dtype) - 1
+    trials = action.expand(-1, len(levels), -1)
+    return levels, trials.scatter(2, moved.expand(-1, len(levels), -1), marks.expand(POINTS, -1, -1))
