@@ -8,8 +8,6 @@ V is differentiated once for a state, and each control that is tried costs one e
 gives one coordinate of the control after the other its best level while the rest stand still. It finds the maximum over
 the levels if H is a sum of functions of one coordinate each, as for a drift that is affine in u and a sigma without u,
 where the maximum is a vertex of the box of controls. Unlike steps along a gradient in u, it leaves a local maximum.
-Where coordinates of the control act together, as a speed and a steering angle do, the best control may differ from a
-good one in several of them at once. There the ascent starts at a vertex of the box, if H is larger there.
 """
 
 from __future__ import annotations
@@ -20,13 +18,9 @@ import torch
 from torch import Tensor
 
 from pirl_rl.arguments import Policy
-from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
-from pirl_rl.structure import controls_interact, has_controlled_noise
-
-MOST_STARTS = 16
-"""The largest number of vertices at which an ascent may start."""
+from pirl_rl.structure import has_controlled_noise
 
 Objective = Callable[[Tensor], Tensor]
 """Maps actions (N, m), normalised to [-1, 1], to numbers (N,), each of which depends on its own action alone.
@@ -162,37 +156,14 @@ def look_ahead_policy(solution: Solution, simulator: Simulator, steps: int, leve
         steps: the number of control steps, at least 1.
         levels: each coordinate of the control has this many candidates, evenly spaced over its range, at least 2.
     """
-    controls, others = solution.problem.controls, starts(solution.problem)
+    controls = solution.problem.controls
 
     def policy(tau: Tensor, x: Tensor) -> Tensor:
         marks = torch.linspace(-1, 1, levels, device=x.device).to(x.dtype)
-        objective = value_ahead(solution, simulator, tau, x, steps)
-        start = best_start(objective, controls.normalize(solution.policy(tau, x)), others)
-        return controls.denormalize(ascend(objective, start, marks)[0])
+        start = controls.normalize(solution.policy(tau, x))
+        return controls.denormalize(ascend(value_ahead(solution, simulator, tau, x, steps), start, marks)[0])
 
     return policy
-
-
-def starts(problem: ReachAvoidProblem) -> Tensor | None:
-    """Vertices (C, m) of the box of actions at which an ascent may start, or None where coordinates act on their own.
-
-    They are all vertices of up to four controls, and `MOST_STARTS` random ones of more.
-    """
-    m = problem.controls.dim
-    if not controls_interact(problem):
-        return None
-    if 2**m <= MOST_STARTS:
-        return torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * m)
-    return 2.0 * torch.randint(2, (MOST_STARTS, m), generator=torch.Generator().manual_seed(0)) - 1
-
-
-def best_start(objective: Objective, action: Tensor, others: Tensor | None) -> Tensor:
-    """The best out of the action (N, m) and the same other actions (C, m) for each point, if there are any."""
-    if others is None:
-        return action
-    trials = torch.cat([action.unsqueeze(0), others.to(action).unsqueeze(1).expand(-1, *action.shape)])
-    index = objective(trials).argmax(0)
-    return trials.gather(0, index[None, :, None].expand(1, *action.shape)).squeeze(0)
 
 
 def ascend(objective: Objective, action: Tensor, levels: Tensor, sweeps: int = 1) -> tuple[Tensor, Tensor]:

@@ -52,33 +52,6 @@ def is_control_affine(problem: ReachAvoidProblem, points: int = 256, seed: int =
     return bool((gap <= ROUNDING * expected.abs().amax(0)).all()) and not has_controlled_noise(problem, points, seed)
 
 
-def controls_interact(problem: ReachAvoidProblem, points: int = 256, seed: int = 0) -> bool:
-    """Whether the effect of a coordinate of the control depends on the others, as with a speed and a steering angle.
-
-    Otherwise drift and sigma sigma^T are sums of functions of one coordinate of u each, up to a function of the state.
-
-    Args:
-        problem: the physics.
-        points: the number of states, each with two controls.
-        seed: of the points.
-    """
-    rng = torch.Generator().manual_seed(seed)
-    x = problem.states.sample(points, rng, torch.float64)
-    one, other = (problem.controls.sample(points, rng, torch.float64) for _ in range(2))
-
-    def physics(u: Tensor) -> Tensor:
-        sigma = problem.diffusion(x, u)
-        return torch.cat([problem.drift(x, u), (sigma @ sigma.mT).flatten(1)], -1)
-
-    for coordinate in range(1, problem.controls.dim):
-        mixed, rest = one.clone(), other.clone()
-        mixed[:, :coordinate], rest[:, :coordinate] = other[:, :coordinate], one[:, :coordinate]
-        ends, middles = physics(one) + physics(other), physics(mixed) + physics(rest)
-        if ((ends - middles).abs() > ROUNDING * ends.abs().amax(0).clamp(min=ROUNDING)).any():
-            return True
-    return False
-
-
 def check_problem(problem: ReachAvoidProblem, points: int = 100_000, seed: int = 0) -> None:
     """Refuse a problem whose parts are missing, have wrong shapes, or contradict each other.
 

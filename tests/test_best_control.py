@@ -14,14 +14,11 @@ from benchmarks.kinds import Bicycle, Gusty, TwoHarbours
 from pirl_rl import Box, ReachAvoidProblem
 from pirl_rl.actor_rules import BestControl, Hamiltonian
 from pirl_rl.ascent import (
-    MOST_STARTS,
     ascend,
-    best_start,
     continued_value,
     expected_ahead,
     hamiltonian,
     improved,
-    starts,
     value_ahead,
 )
 from pirl_rl.assembly import make_trainer
@@ -32,7 +29,7 @@ from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.problems import PlanarQuadrotor, Reach1D, VehicleDrift
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
-from pirl_rl.structure import controls_interact, has_controlled_noise
+from pirl_rl.structure import has_controlled_noise
 from pirl_rl.switching import COARSE, JUMPS, control_levels, jumps_over_worse_controls, switching
 
 
@@ -215,42 +212,6 @@ def test_coordinates_that_are_worse_together_are_not_changed_together():
 
     best, _ = improved(objective, torch.zeros(1, 2), torch.tensor([-1.0, 0.0, 1.0]))
     assert best.tolist() == [[1.0, 0.0]]
-
-
-def test_a_vertex_leads_out_of_a_local_maximum_of_two_coordinates():
-    """f(a) = a_1 a_2 - 0.1 (a_1 + a_2) has a maximum at (1, 1), and a higher one at (-1, -1)."""
-
-    def objective(action):
-        return action.prod(-1) - 0.1 * action.sum(-1)
-
-    start, levels = torch.tensor([[1.0, 1.0], [-0.9, -0.8]]), torch.tensor([-1.0, 1.0])
-    assert improved(objective, start, levels)[0].tolist() == [[1.0, 1.0], [-1.0, -1.0]]
-    better = best_start(objective, start, starts(Bicycle()))
-    assert improved(objective, better, levels)[0].tolist() == [[-1.0, -1.0], [-1.0, -1.0]]
-    assert best_start(objective, start, None) is start
-
-
-@pytest.mark.parametrize(
-    ("problem", "interact"),
-    [(Bicycle(), True), (Gusty(), False), (Steered(True), False), (VehicleDrift(), False), (PlanarQuadrotor(), False)],
-    ids=lambda value: type(value).__name__,
-)
-def test_controls_that_act_together(problem, interact):
-    assert controls_interact(problem) == interact
-    assert (starts(problem) is not None) == interact
-
-
-def test_many_controls_that_act_together_have_few_starts():
-    class Chain(Steered):
-        controls = Box([-1.0] * 30, [1.0] * 30)
-
-        def drift(self, x: Tensor, u: Tensor) -> Tensor:
-            return (u[..., 1:] * u[..., :-1]).unflatten(-1, (-1, 1)).sum(-2).expand_as(x)
-
-    found = starts(Chain())
-    assert found.shape == (MOST_STARTS, 30)
-    assert found.abs().eq(1).all()
-    assert len(found.unique(dim=0)) == MOST_STARTS
 
 
 @pytest.mark.parametrize(("tilt", "inertia", "expected"), [(0.05, 0.0, 1.0), (0.05, 0.1, -1.0), (0.5, 0.1, 1.0)])

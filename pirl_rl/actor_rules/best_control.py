@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from pirl_rl.actor_rules.base import ActorRule
-from pirl_rl.ascent import Flow, Objective, best_start, expected_ahead, hamiltonian, improved, starts, value_ahead
+from pirl_rl.ascent import Flow, Objective, expected_ahead, hamiltonian, improved, value_ahead
 from pirl_rl.errors import ArgumentError
 from pirl_rl.networks import Critic
 from pirl_rl.operators import masked_mean
@@ -43,8 +43,7 @@ class BestControl(ActorRule):
     step with the candidate, the others with the policy, the rollout algorithm of D. Bertsekas (Rollout, Policy
     Iteration, and Distributed Reinforcement Learning, 2020).
 
-    Each coordinate takes its best level while the others stand still, see `pirl_rl.ascent.improved`. Where coordinates
-    of the control act together, the vertices of the box of actions are tried first, see `pirl_rl.ascent.starts`.
+    Each coordinate takes its best level while the others stand still, see `pirl_rl.ascent.improved`.
 
     Args:
         problem: the physics.
@@ -90,7 +89,6 @@ class BestControl(ActorRule):
         self.cubature = steps == 0 and self.controlled_noise and channels * problem.controls.dim <= 64
         self.simulated = steps or (2 * channels if self.cubature else 0)
         self.flow: Flow = simulator.flow
-        self.starts = starts(problem)
 
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
         actor, choice = solution.actor, solution.actor.choice
@@ -102,7 +100,7 @@ class BestControl(ActorRule):
             action = actor.layers[-1](logits)
             objective = self._objective(solution, tau.squeeze(-1), x)
             levels = torch.linspace(-1, 1, number).to(action)
-            best, weight = improved(objective, best_start(objective, action, self.starts), levels, self.inertia)
+            best, weight = improved(objective, action, levels, self.inertia)
         if choice:
             scores = logits.unflatten(-1, (-1, choice.choices))
             entropy = torch.nn.functional.cross_entropy(scores.movedim(-1, 1), choice.indices(best), reduction="none")
