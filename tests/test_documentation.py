@@ -17,7 +17,8 @@ from pirl_rl.commands.methods import check_method
 
 ROOT = Path(__file__).parent.parent
 TEXTS = [
-    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "models/drift/README.md")),
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
+    *sorted((ROOT / "models").glob("*/README.md")),
     *sorted((ROOT / "docs").glob("*.md")),
 ]
 LINK = re.compile(r"\]\(((?!\w+:|#)[^)#\s]+)")
