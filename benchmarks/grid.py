@@ -74,14 +74,14 @@ def dubins(points: int, rollouts: int = 2_000) -> None:
     print(f"share of the states within three standard errors {(distance <= 3 * noise).double().mean():.2f}")
 
 
-def against(run_dir: str, points: int, rollouts: int = 400, count: int = 400) -> None:
+def against(run_dir: str, points: int, steps: int | None, rollouts: int = 400, count: int = 400) -> None:
     """Print the mean success of a run's policy and of the grid's, at the same states and with the same noise."""
     run = load_run(run_dir)
     problem, simulator = run.problem, run.simulator
-    solution, (tau, x) = GridSolver(problem, points).solve(), states(problem, count)
-    steps = {"dt": simulator.dt, "substeps": simulator.substeps, "crossing": simulator.crossing}
+    solution, (tau, x) = GridSolver(problem, points, steps).solve(), states(problem, count)
+    clock = {"dt": simulator.dt, "substeps": simulator.substeps, "crossing": simulator.crossing}
     for name, policy in (("run", run.solution.policy), ("grid", solution.policy)):
-        played = monte_carlo(problem, policy, tau, x, rollouts=rollouts, **steps)
+        played = monte_carlo(problem, policy, tau, x, rollouts=rollouts, **clock)
         error = (played.probability * (1 - played.probability) / rollouts).sum().sqrt() / len(x)
         print(f"success of the {name}'s policy {played.probability.mean():.4f} +- {error:.4f}", flush=True)
     print(f"mean V of the grid {solution.value(tau, x).mean():.4f}, estimate {solution.error(tau, x).mean():.4f}")
@@ -92,11 +92,14 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--dubins", action="store_true")
     parser.add_argument("--points", type=int, default=51, help="nodes along each axis")
+    parser.add_argument(
+        "--steps", type=int, help="steps in time to go, with --run; by default they follow from the problem"
+    )
     parser.add_argument("--run", help="compare the policy of this run directory with the grid's")
     parser.add_argument("--json", type=Path, help="write what is found in one and two dimensions to this file")
     arguments = parser.parse_args()
     if arguments.run:
-        against(arguments.run, arguments.points)
+        against(arguments.run, arguments.points, arguments.steps)
     elif arguments.dubins:
         dubins(arguments.points)
     else:
