@@ -186,8 +186,8 @@ class GridSolution:
 
         The scheme is of first order or better, so that the distance is at least about the error of the fine solution,
         and well above that of the extrapolated `value` where the order is 1. In cells that a face cuts V may rise from
-        the face within a layer that is thinner than the cell. Close to the face both solutions are near the value of
-        the set there, and so the largest of the distances at x and at the corners of the cell counts.
+        the face within a layer that is thinner than the cell. Where V is linear in such cells, both solutions are near
+        the value of the set close to the face, and so the largest of the distances at x and at the corners counts.
 
         Raises:
             ArgumentError: the solution was computed without an estimate, or a tau is outside [0, horizon].
@@ -196,6 +196,8 @@ class GridSolution:
             raise ArgumentError("error: expected a solution with an estimate, got one of GridSolver(estimate=False)")
         x = self.problem.states.wrap(x)
         error = self._distance(tau, x)
+        if self.split:
+            return error
         cut = ~self.coarse._uncut(x)
         for nodes in self.mesh.corners(x[cut].detach().double().cpu().numpy())[0]:
             corners = torch.from_numpy(self.mesh.states(self.mesh.indices()[nodes])).to(x)
