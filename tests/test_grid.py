@@ -172,10 +172,9 @@ class Slanted(ReachAvoidProblem):
         return 1 - x[..., 1]
 
     def exact_value(self, tau: Tensor, x: Tensor) -> Tensor:
-        d, spread = (1 - x[..., 1]).clamp(min=0), math.hypot(*self.sigma) * tau.sqrt()
-        far = (
-            torch.special.log_ndtr((-self.speed * tau - d) / spread) + 2 * self.speed * d / math.hypot(*self.sigma) ** 2
-        )
+        sigma = math.hypot(*self.sigma)
+        d, spread = (1 - x[..., 1]).clamp(min=0), sigma * tau.sqrt()
+        far = torch.special.log_ndtr((-self.speed * tau - d) / spread) + 2 * self.speed * d / sigma**2
         return torch.special.ndtr((self.speed * tau - d) / spread) + far.exp()
 
 

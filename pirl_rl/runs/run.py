@@ -81,7 +81,7 @@ class Run:
                 the others with the actor's. The candidate with the largest V at their end is taken, see
                 `pirl_rl.ascent`; with 0, the actor's control is.
             levels: each coordinate of the control has this many candidates, evenly spaced over its range. None takes
-                33 where one of the controls is a heading, and else five.
+                as many as the physics needs, at least five, see `pirl_rl.switching.control_levels`.
         """
         chosen = levels is None or (isinstance(levels, int) and levels >= 2)
         if not (isinstance(lookahead, int) and lookahead >= 0 and chosen):
