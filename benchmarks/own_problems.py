@@ -4,10 +4,10 @@
 
 Gusty and Slalom, with other seeds and states, were among the problems on which the logarithms of the levels, the
 numbers and widths of the layers and the rules of where episodes start were chosen, Gusty on which the inertia of
-`BestControl` and the choices of the actor were, TwoHarbours on which the number of choices of a heading was, and Bicycle
-on which the rule for choices was; the others had no part in any choice. V and the success of the learned policy are compared with the grid, in the way of the
-suite, at 400 states with 1,000 paths from each. A run takes minutes; a finished one is loaded, so that other settings
-need another folder.
+`BestControl` and the choices of the actor were, TwoHarbours on which the number of choices of a heading was, and
+Bicycle on which the rule for choices was; the others had no part in any choice. V and the success of the learned policy
+are compared with the grid, in the way of the suite, at 400 states with 1,000 paths from each. With three states and two
+controls there is no truth. A run takes minutes; a finished one is loaded, so that other settings need another folder.
 """
 
 from __future__ import annotations
