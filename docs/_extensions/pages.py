@@ -21,7 +21,6 @@ TEXTS = {
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
     "models/drift/README.md": "model_drift.md",
-    "models/drift_recipe/README.md": "model_drift_recipe.md",
 }
 OPTIONS = ("members", "ignore-module-all", "show-inheritance")  # what a package gathers is shown where it is written
 LINK = re.compile(r"\]\(((?!\w+:|#)[^)#\s]+)")
