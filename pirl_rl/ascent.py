@@ -147,42 +147,43 @@ def value_ahead(
     return value
 
 
-def look_ahead_policy(solution: Solution, simulator: Simulator, steps: int, levels: int) -> Policy:
+def look_ahead_policy(solution: Solution, simulator: Simulator, steps: int, levels: Tensor) -> Policy:
     """The policy that takes the control with the largest V some control steps ahead, see `value_ahead`.
 
     Args:
         solution: gives V, and the policy at which the search starts and which it follows after the first step.
         simulator: simulates the control steps.
         steps: the number of control steps, at least 1.
-        levels: each coordinate of the control has this many candidates, evenly spaced over its range, at least 2.
+        levels: the candidates (K, s) for s coordinates of the control together, see `ascend`.
     """
     controls = solution.problem.controls
 
     def policy(tau: Tensor, x: Tensor) -> Tensor:
-        marks = torch.linspace(-1, 1, levels, device=x.device).to(x.dtype)
         start = controls.normalize(solution.policy(tau, x))
-        return controls.denormalize(ascend(value_ahead(solution, simulator, tau, x, steps), start, marks)[0])
+        return controls.denormalize(ascend(value_ahead(solution, simulator, tau, x, steps), start, levels.to(x))[0])
 
     return policy
 
 
 def ascend(objective: Objective, action: Tensor, levels: Tensor, sweeps: int = 1) -> tuple[Tensor, Tensor]:
-    """Coordinate-wise ascent over levels.
+    """Ascent over levels, one coordinate of the action or one group of s coordinates after the other.
 
     Args:
         objective: the function to maximise.
         action: where the ascent starts (N, m).
-        levels: the levels (k,) of each coordinate.
+        levels: the levels (k,) of each coordinate, or the combinations (K, s) of levels of each s coordinates in a row.
         sweeps: how often it passes through all coordinates.
 
     Returns:
         The action (N, m) that was found, and its objective (N,), which is at least that of the start.
     """
-    best = objective(action)
+    levels = levels.reshape(len(levels), -1)
+    best, size = objective(action), levels.shape[1]
     for _ in range(sweeps):
-        for i in range(action.shape[-1]):
+        for i in range(0, action.shape[-1], size):
             for level in levels.unbind():
-                trial = replaced(action, i, level)
+                trial = action.clone()
+                trial[:, i : i + size] = level
                 value = objective(trial)
                 better = value > best
                 best, action = torch.where(better, value, best), torch.where(better.unsqueeze(-1), trial, action)
@@ -193,33 +194,40 @@ def improved(objective: Objective, action: Tensor, levels: Tensor, inertia: floa
     """The best level of each coordinate while the others stand still, for all coordinates in one call of the objective.
 
     If H is a sum of functions of one coordinate each, the best levels together are the maximum over the levels. Where
-    they are worse together than the best of them alone, that one alone is taken.
+    they are worse together than the best of them alone, that one alone is taken. Groups of s coordinates take the place
+    of coordinates where the levels are combinations of theirs.
 
     Inertia decides between levels that are nearly as good as each other: from an action to each level, the objective
-    loses this share of its range over the levels for each unit of their distance. Between the two maxima of a function
-    whose minimum lies in the middle, an action then goes to one and stays there. Where the objective is affine in a
-    coordinate, the best of two bounds stays the best with any inertia below 1/2.
+    loses this share of its range over the levels for each unit of their distance, which is the largest of those of the
+    coordinates in a group. Between the two maxima of a function whose minimum lies in the middle, an action then goes
+    to one and stays there. Where the objective is affine in a coordinate, the best of two bounds stays the best with
+    any inertia below 1/2.
 
     Args:
         objective: the function to maximise, for actions (*, N, m).
         action: the action (N, m) that is improved.
-        levels: the levels (k,) of each coordinate, bounds included.
+        levels: the levels (k,) of each coordinate, bounds included, or the combinations (K, s) of levels of each s
+            coordinates in a row.
         inertia: that share, >= 0.
 
     Returns:
-        The action (N, m), whose objective is at least that of the given one, and how much each coordinate matters
-        (N, m): the range of the objective over its levels and the given action.
+        The action (N, m), whose objective is at least that of the given one, and how much each group matters
+        (N, m / s): the range of the objective over its levels and the given action.
     """
-    size = action.shape[-1]
-    own = torch.eye(size, dtype=torch.bool, device=action.device)[:, None, None]
-    values, before = objective(torch.where(own, levels[:, None, None], action)), objective(action)
+    levels = levels.reshape(len(levels), -1)
+    size = levels.shape[1]
+    groups = action.shape[-1] // size
+    own = torch.eye(groups, dtype=torch.bool, device=action.device).repeat_interleave(size, 1)
+    values = objective(torch.where(own[:, None, None], levels.repeat(1, groups).unsqueeze(1), action))
+    before = objective(action)
     stakes = torch.maximum(values.amax(1), before) - torch.minimum(values.amin(1), before)
-    distance = (levels[:, None, None] - action.mT).abs().movedim(0, 1)
+    parts = action.unflatten(-1, (groups, size)).movedim(-2, 0)  # (groups, N, s)
+    distance = (levels[:, None] - parts.unsqueeze(1)).abs().amax(-1)
     index = (values - inertia * stakes.unsqueeze(1) * distance).argmax(1)
     top = values.gather(1, index.unsqueeze(1)).squeeze(1)
-    together = torch.where(top > before, levels[index], action.mT).mT
+    together = torch.where((top > before).unsqueeze(-1), levels[index], parts).movedim(0, -2).flatten(-2)
     alone, which = top.max(0)
-    single = torch.where(torch.nn.functional.one_hot(which, size).bool(), together, action)
+    single = torch.where(own[which], together, action)
     best = torch.where((objective(together) >= alone).unsqueeze(-1), together, single)
     return best, stakes.mT
 

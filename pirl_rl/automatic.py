@@ -11,13 +11,14 @@ from pirl_rl.errors import ArgumentError, ConfigError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
 from pirl_rl.structure import check_problem, noise_channels
-from pirl_rl.switching import control_levels, jumps_over_worse_controls
+from pirl_rl.switching import control_levels, coordinates_together, jumps_over_worse_controls
 from pirl_rl.time_steps import check_time_steps, propose_time_steps
 
 AUTO = "auto"
 """The value that leaves a choice to the package.
 
-Keys that take it: env.dt, env.substeps, trainer.updates, actor.choices, loss.hjb_probes and the entries of `PATHS`.
+Keys that take it: env.dt, env.substeps, trainer.updates, actor.choices, actor.together, loss.hjb_probes and the entries
+of `PATHS`.
 """
 
 UPDATES_PER_DIMENSION, FEW_STATES, UPDATES_OF_MANY = 2_300, 3, 2_900
@@ -86,23 +87,32 @@ def choose_updates(config: DictConfig, problem: ReachAvoidProblem) -> None:
 
 
 def choose_choices(config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[str] = ()) -> None:
-    """Replace `auto` in actor.choices by a number where the best control jumps over worse ones, else by None.
+    """Replace `auto` in actor.choices and actor.together by numbers that follow from the problem.
 
-    See `pirl_rl.switching`. Where a rule of the run, or of one of its stages, needs the gradient of the policy, there
-    are no choices.
+    There are choices where the best control jumps over worse ones, and else none, see `pirl_rl.switching`. Where a rule
+    of the run, or of one of its stages, needs the gradient of the policy, there are none either.
 
     Args:
         config: the configuration of a run.
         problem: the physics.
         trust: modules outside the package that may hold an actor rule.
     """
-    if not isinstance(config.actor, DictConfig) or config.actor.get("choices") != AUTO:
+    if not isinstance(config.actor, DictConfig):
         return
+    if config.actor.get("choices") == AUTO:
+        config.actor.choices = control_levels(problem) if _jumps(config, problem, trust) else None
+    if config.actor.get("together") == AUTO:
+        choices = config.actor.get("choices")
+        config.actor.together = coordinates_together(problem, choices) if isinstance(choices, int) else 1
+
+
+def _jumps(config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[str]) -> bool:
+    """Whether the policy should jump, and all actor rules of the run and its stages can train one that does."""
     stages = config.get("stages")
     of_stages = [f"stages[{i}].actor_rule" for i in range(len(stages) if isinstance(stages, ListConfig) else 0)]
     rules = ["loss.actor_rule", *(key for key in of_stages if OmegaConf.select(config, key) is not None)]
     trains = all(_trains_choices(config, f"{key}._target_", trust) for key in rules)
-    config.actor.choices = control_levels(problem) if trains and jumps_over_worse_controls(problem) else None
+    return trains and jumps_over_worse_controls(problem)
 
 
 def _trains_choices(config: DictConfig, key: str, trust: Sequence[str]) -> bool:

@@ -172,28 +172,38 @@ class Periodic(nn.Module):
 class Choice(nn.Module):
     """For each of m outputs, that of k numbers evenly spaced over [-1, 1] which has the largest of its k scores.
 
-    It maps scores (*, m k) to (*, m). The output has no gradient in the scores.
+    With `together` = s > 1, groups of s outputs have one score for each of the k^s combinations of their numbers. The
+    layer maps scores (*, m / s * k^s) to (*, m). The output has no gradient in the scores.
 
     Args:
         choices: the number k, at least 2.
+        together: the number s, at least 1.
 
     Raises:
-        ArgumentError: `choices` is no integer of at least 2.
+        ArgumentError: `choices` is no integer of at least 2, or `together` none of at least 1.
     """
 
-    def __init__(self, choices: int):
+    def __init__(self, choices: int, together: int = 1):
         super().__init__()
-        if not (isinstance(choices, int) and choices >= 2):
-            raise ArgumentError(f"choices: expected an integer of at least 2, got {choices!r}")
-        self.choices = choices
+        for name, number, least in (("choices", choices, 2), ("together", together, 1)):
+            if not (isinstance(number, int) and number >= least):
+                raise ArgumentError(f"{name}: expected an integer of at least {least}, got {number!r}")
+        self.choices, self.together = choices, together
 
     def forward(self, scores: Tensor) -> Tensor:
-        return self.numbers(scores.unflatten(-1, (-1, self.choices)).argmax(-1)).to(scores.dtype)
+        return self.combinations(scores)[self.grouped(scores).argmax(-1)].flatten(-2)
 
-    def numbers(self, index: Tensor) -> Tensor:
-        """The numbers (*) with indices (*) from 0 to k - 1."""
-        return 2 * index / (self.choices - 1) - 1
+    def grouped(self, scores: Tensor) -> Tensor:
+        """The scores (*, m / s * k^s) of all groups as (*, m / s, k^s)."""
+        return scores.unflatten(-1, (-1, self.choices**self.together))
+
+    def combinations(self, like: Tensor) -> Tensor:
+        """All combinations (k^s, s) of the numbers of one group, with the dtype and the device of a tensor."""
+        numbers = torch.linspace(-1, 1, self.choices, dtype=like.dtype, device=like.device)
+        return torch.cartesian_prod(*[numbers] * self.together).reshape(-1, self.together)
 
     def indices(self, numbers: Tensor) -> Tensor:
-        """The indices (*) of the choices that are nearest to numbers (*) in [-1, 1]."""
-        return ((numbers + 1) * ((self.choices - 1) / 2)).round().long()
+        """The indices (*, m / s) of the combinations that are nearest to numbers (*, m) in [-1, 1]."""
+        places = ((numbers + 1) * ((self.choices - 1) / 2)).round().long().unflatten(-1, (-1, self.together))
+        # The last number of a combination changes first.
+        return (places * self.choices ** torch.arange(self.together - 1, -1, -1, device=places.device)).sum(-1)

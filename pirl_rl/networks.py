@@ -15,6 +15,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from pirl_rl.errors import ArgumentError
 from pirl_rl.layers import Choice
 from pirl_rl.perceptrons import initialise_xavier, perceptron, spread_zeros
 from pirl_rl.problem import ReachAvoidProblem
@@ -39,10 +40,13 @@ class Actor(nn.Module):
             of so many numbers evenly spaced over [-1, 1], bounds included, each of which has a score, see `Choice`. The
             control may then jump between two of them along a surface, where a tangent has to pass through all between
             them. It has no gradient, so that only `BestControl` can train it.
+        together: the number of coordinates of the control that are chosen together, with one score for each combination
+            of their numbers. Where the best control changes in several coordinates at once, they then jump along the
+            same surface.
 
     Raises:
-        ArgumentError: `activation` is not the name of a layer of `torch.nn`, `spread` is not positive, or `choices` is
-            no integer of at least 2.
+        ArgumentError: `activation` is not the name of a layer of `torch.nn`, `spread` is not positive, `choices` is no
+            integer of at least 2, or `together` does not divide the number of controls.
     """
 
     def __init__(
@@ -55,16 +59,21 @@ class Actor(nn.Module):
         spread: float | None = None,
         levels: bool = False,
         choices: int | None = None,
+        together: int = 1,
     ):
         super().__init__()
-        self.choice = None if choices is None else Choice(choices)
-        outputs = problem.controls.dim * (1 if choices is None else choices)
+        outputs = problem.controls.dim
+        self.choice = None if choices is None else Choice(choices, together)
+        if self.choice:
+            if outputs % together:
+                raise ArgumentError(f"together: expected a divisor of the number {outputs} of controls, got {together}")
+            outputs = outputs // together * self.choice.choices**together
         output = self.choice or "Tanh"
         self.layers = perceptron(problem, 0, hidden, outputs, activation, output, root_time, scaling, levels)
         spread_zeros(self.layers, spread, problem, 0)
 
     def logits(self, tau: Tensor, state: Tensor) -> Tensor:
-        """The input of the last layer: (N, m) of the hyperbolic tangent, or the scores (N, m k) of k choices."""
+        """The input of the last layer: (N, m) of the hyperbolic tangent, or the scores of the choices, see `Choice`."""
         return self.layers[:-1](torch.cat([tau, state], -1))
 
     def forward(self, tau: Tensor, state: Tensor) -> Tensor:

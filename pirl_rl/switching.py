@@ -21,7 +21,8 @@ LEVELS, FINE_LEVELS = 5, 33
 """The numbers of levels of a control where two, its bounds, do not hold the best one, and where five are too few."""
 
 JUMPS = 0.25
-"""The share of jumps over worse controls from which a policy should jump."""
+"""The share of jumps over worse controls from which a policy should jump, and that of jumps in several coordinates from
+which it should choose these together."""
 
 COARSE = 0.005
 """What `LEVELS` may lose against the best control, as a share of the range of p . f, before they are too few."""
@@ -35,6 +36,9 @@ MARKS = 17
 TOGETHER = 2
 """The largest number of coordinates of u that change together; the others are drawn at random."""
 
+MOST_COMBINATIONS = 125
+"""The largest number of combinations of the levels of all coordinates among which a policy chooses."""
+
 FAR = 4
 """The least number of levels in a coordinate that makes a change of the best control a jump."""
 
@@ -47,10 +51,12 @@ class Switching(NamedTuple):
 
     Attributes:
         jumps: the share of the jumps that lead over worse controls; 0 where there is no jump.
+        joint: the share of the jumps that change several coordinates of the control at once.
         coarseness: the mean of what `LEVELS` levels lose against `MARKS`, as a share of the range of p . f.
     """
 
     jumps: float
+    joint: float
     coarseness: float
 
 
@@ -76,6 +82,35 @@ def control_levels(problem: ReachAvoidProblem) -> int:
     return FINE_LEVELS if found.jumps > JUMPS and found.coarseness > COARSE else LEVELS
 
 
+def coordinates_together(problem: ReachAvoidProblem, levels: int) -> int:
+    """The number of coordinates of the control that are chosen together: all of them, or one at a time.
+
+    To turn a car round, forwards to the left becomes backwards to the right. Each half of this change alone is for the
+    worse, so that a search in one coordinate does not find it. Whole controls are chosen where many of the jumps are of
+    this kind, and the combinations of all levels are few.
+
+    Args:
+        problem: the physics.
+        levels: the number of levels of each coordinate.
+    """
+    m = problem.controls.dim
+    few = m > 1 and levels**m <= MOST_COMBINATIONS
+    return m if few and switching(problem).joint > JUMPS else 1
+
+
+def candidate_controls(problem: ReachAvoidProblem, levels: int | None = None) -> Tensor:
+    """Normalised candidates (K, s) for s coordinates of the control together, among which a look ahead chooses.
+
+    Args:
+        problem: the physics.
+        levels: the number of levels of each coordinate, bounds included, at least 2. None takes that of
+            `control_levels`, and at least `LEVELS`, since V ahead is not affine in u.
+    """
+    levels = max(LEVELS, control_levels(problem)) if levels is None else levels
+    together = coordinates_together(problem, levels)
+    return torch.cartesian_prod(*[torch.linspace(-1, 1, levels)] * together).reshape(-1, together)
+
+
 def switching(problem: ReachAvoidProblem, seed: int = 0) -> Switching:
     """How the best control changes along lines of directions p, at random states, for the drift alone.
 
@@ -95,14 +130,16 @@ def switching(problem: ReachAvoidProblem, seed: int = 0) -> Switching:
     spread = (top - score.amin(-1)).mean(1, keepdim=True).clamp(min=1e-12)
 
     before, after = levels[best[:, :-1]], levels[best[:, 1:]]
-    jumped = ((before - after).abs() >= FAR).any(-1)
+    far = (before - after).abs() >= FAR
+    jumped = far.any(-1)
     base = MARKS ** torch.arange(levels.shape[1] - 1, -1, -1)
     middle = score[:, 1:].gather(2, (base * ((before + after) // 2)).sum(-1, keepdim=True)).squeeze(-1)
     worse = jumped & ((top[:, 1:] - middle) / spread > WORSE)
 
     few = (levels % ((MARKS - 1) // (LEVELS - 1)) == 0).all(-1)
     lost = (top - score[..., few].amax(-1)) / spread
-    return Switching((worse.sum() / jumped.sum().clamp(min=1)).item(), lost.mean().item())
+    jumps, joint = ((kind.sum() / jumped.sum().clamp(min=1)).item() for kind in (worse, far.sum(-1) > 1))
+    return Switching(jumps, joint, lost.mean().item())
 
 
 def _trials(m: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from benchmarks.kinds import Bicycle, Gusty, TwoHarbours
+from benchmarks.kinds import Bicycle, Gusty, Loiter, TwoHarbours
 from pirl_rl import Box, ReachAvoidProblem
 from pirl_rl.actor_rules import BestControl, Hamiltonian
 from pirl_rl.ascent import (
@@ -30,7 +30,7 @@ from pirl_rl.problems import PlanarQuadrotor, Reach1D, VehicleDrift
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 from pirl_rl.structure import has_controlled_noise
-from pirl_rl.switching import COARSE, JUMPS, control_levels, jumps_over_worse_controls, switching
+from pirl_rl.switching import COARSE, JUMPS, candidate_controls, control_levels, jumps_over_worse_controls, switching
 
 
 class Steered(ReachAvoidProblem):
@@ -214,6 +214,35 @@ def test_coordinates_that_are_worse_together_are_not_changed_together():
     assert best.tolist() == [[1.0, 0.0]]
 
 
+def test_coordinates_together_find_what_none_of_them_finds_alone():
+    """f(a) = a_1 a_2 - 0.3 a_1: from (1, 1) each step in one coordinate is for the worse, and (-1, -1) is the best."""
+
+    def objective(action):
+        return action[..., 0] * action[..., 1] - 0.3 * action[..., 0]
+
+    start, marks = torch.ones(1, 2), torch.tensor([-1.0, 0.0, 1.0])
+    pairs = torch.cartesian_prod(marks, marks)
+    assert improved(objective, start, marks)[0].tolist() == ascend(objective, start, marks)[0].tolist() == [[1.0, 1.0]]
+    best, stakes = improved(objective, start, pairs)
+    assert best.tolist() == ascend(objective, start, pairs)[0].tolist() == [[-1.0, -1.0]]
+    assert stakes.tolist() == [[pytest.approx(1.3 + 1.3)]]
+    # The distance of a pair is the larger one of both, 2: the gain 0.6 has to exceed 2 * 0.1 * 2.6, or 2 * 0.2 * 2.6.
+    assert improved(objective, start, pairs, 0.1)[0].tolist() == [[-1.0, -1.0]]
+    assert improved(objective, start, pairs, 0.2)[0].tolist() == [[1.0, 1.0]]
+
+
+def test_groups_of_coordinates_are_improved_at_once():
+    """f is a sum over the pairs (a_1, a_2) and (a_3, a_4), of which the first has its best at (-1, -1)."""
+
+    def objective(action):
+        return action[..., 0] * action[..., 1] - 0.3 * action[..., 0] + action[..., 2] - action[..., 3]
+
+    marks = torch.tensor([-1.0, 0.0, 1.0])
+    best, stakes = improved(objective, torch.ones(5, 4), torch.cartesian_prod(marks, marks))
+    assert torch.equal(best, torch.tensor([[-1.0, -1.0, 1.0, -1.0]]).expand(5, 4))
+    assert torch.allclose(stakes, torch.tensor([[2.6, 4.0]]))
+
+
 @pytest.mark.parametrize(("tilt", "inertia", "expected"), [(0.05, 0.0, 1.0), (0.05, 0.1, -1.0), (0.5, 0.1, 1.0)])
 def test_inertia_decides_between_levels_that_are_nearly_as_good(tilt, inertia, expected):
     """f(a) = |a| + tilt a from -0.8: the penalty of the bound 1 exceeds that of -1 by 0.1 * 1.6 of the range."""
@@ -261,9 +290,9 @@ def test_where_candidates_are_simulated_the_points_are_fewer():
     """
     problem = Steered(controlled=True)
     simulator = Simulator(problem, 0.1)
-    assert BestControl(problem, simulator, budget=10 * 60 + 59).most_points(controls=3, levels=5) == 10
-    assert BestControl(problem, simulator, budget=10 * 84 + 83).most_points(controls=3, levels=7) == 10
-    assert BestControl(problem, simulator, steps=2, budget=10 * 30 + 29).most_points(controls=3, levels=5) == 10
+    assert BestControl(problem, simulator, budget=10 * 60 + 59).most_points(groups=3, levels=5) == 10
+    assert BestControl(problem, simulator, budget=10 * 84 + 83).most_points(groups=3, levels=7) == 10
+    assert BestControl(problem, simulator, steps=2, budget=10 * 30 + 29).most_points(groups=3, levels=5) == 10
 
 
 @pytest.mark.parametrize("controlled", [False, True])
@@ -339,15 +368,19 @@ def test_levels_of_a_control(problem, levels):
 
 
 @pytest.mark.parametrize(
-    ("problem", "jumps", "coarse"),
-    [(Steered(), False, False), (VehicleDrift(), False, False), (Bicycle(), True, False), (TwoHarbours(), True, True)],
+    ("problem", "jumps", "joint", "coarse"),
+    [
+        *((Steered(), False, False, False), (VehicleDrift(), False, False, False)),
+        *((Bicycle(), True, True, False), (TwoHarbours(), True, False, True), (Loiter(), True, False, True)),
+    ],
     ids=lambda value: type(value).__name__,
 )
-def test_jumps_over_worse_controls(problem, jumps, coarse):
+def test_jumps_over_worse_controls(problem, jumps, joint, coarse):
     """Forwards to the left and backwards to the right are vertices, for which five levels suffice; headings are not."""
     for seed in range(3):
         found = switching(problem, seed)
         assert (found.jumps > JUMPS) == jumps
+        assert (found.joint > JUMPS) == joint
         assert (found.coarseness > COARSE) == coarse
     assert jumps_over_worse_controls(problem) == jumps
 
@@ -359,7 +392,7 @@ def test_noise_that_depends_on_the_control_makes_it_jump():
 
 def test_the_best_of_an_affine_drift_jumps_over_equals():
     """At the moment of a jump p . f is constant along the coordinate, so that no control between is worse."""
-    assert switching(Steered()) == (0.0, 0.0)
+    assert switching(Steered())[::2] == (0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -381,10 +414,27 @@ def test_the_actor_chooses_where_the_noise_depends_on_the_control(controlled, ty
     assert config.actor.choices == choices
 
 
-def test_the_actor_chooses_a_heading():
-    config = compose("train", ["+experiment=reach1d"])
-    choose_choices(config, Heading())
-    assert config.actor.choices == 33
+@pytest.mark.parametrize(
+    ("problem", "typed", "choices", "together"),
+    [
+        (Heading(), [], 33, 1),
+        (Bicycle(), [], 5, 2),
+        (Bicycle(), ["actor.together=1"], 5, 1),
+        (Bicycle(), ["actor.choices=12"], 12, 1),  # 144 combinations
+        (Steered(), [], None, 1),
+        (Steered(controlled=True), [], 5, 1),
+    ],
+)
+def test_the_actor_chooses_whole_controls_where_their_combinations_are_few(problem, typed, choices, together):
+    config = compose("train", ["+experiment=reach1d", *typed])
+    choose_choices(config, problem)
+    assert (config.actor.choices, config.actor.together) == (choices, together)
+
+
+def test_a_look_ahead_tries_whole_controls_where_the_best_one_jumps():
+    assert candidate_controls(Bicycle()).shape == (25, 2)
+    assert candidate_controls(Bicycle(), 13).shape == (13, 1)  # 169 combinations
+    assert candidate_controls(Steered()).tolist() == [[-1.0], [-0.5], [0.0], [0.5], [1.0]]
 
 
 def test_a_rule_that_needs_the_gradient_of_the_policy_refuses_choices():

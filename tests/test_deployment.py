@@ -53,13 +53,15 @@ np.savez(sys.argv[3], **answer, **{"meta_" + name: np.array(entry) for name, ent
 """
 
 
-def solution_of(problem: ReachAvoidProblem, critics: int = 1, choices: int | None = None, **settings) -> Solution:
+def solution_of(problem: ReachAvoidProblem, critics: int = 1, choice: dict | None = None, **settings) -> Solution:
     """New networks for a problem, with a fixed seed."""
     torch.manual_seed(0)
     features = {"root_time": True, "levels": True, "activation": "SiLU", "spread": 3.0, "hidden": (16,)}
     critic = features | {"output": "Sigmoid", "log_levels": settings.get("levels", True)} | settings
     return Solution(
-        problem, Actor(problem, **features, choices=choices), stack([Critic(problem, **critic) for _ in range(critics)])
+        problem,
+        Actor(problem, **features, **(choice or {})),
+        stack([Critic(problem, **critic) for _ in range(critics)]),
     )
 
 
@@ -109,9 +111,10 @@ def dubins(tmp_path_factory) -> tuple[Solution, Path]:
         solution_of(Pendulum(), activation="Tanh"),
         solution_of(VehicleDrift()),
         solution_of(Reach1D(), hidden=()),
-        solution_of(PlanarQuadrotor(), choices=5),
+        solution_of(PlanarQuadrotor(), choice={"choices": 5}),
+        solution_of(PlanarQuadrotor(), choice={"choices": 3, "together": 2}),
     ],
-    ids=["periodic", "smoothed", "plain", "invariance", "unreachable", "no avoid set", "choices"],
+    ids=["periodic", "smoothed", "plain", "invariance", "unreachable", "no avoid set", "choices", "together"],
 )
 def test_the_program_computes_what_the_solution_does(solution):
     """In double precision nothing but rounding differs, of the order of 1e-16 times the slope of the networks."""

@@ -84,7 +84,27 @@ def test_an_actor_chooses_the_number_with_the_largest_score():
     assert {*action.unique().tolist()} == {-1.0, -0.5, 0.0, 0.5, 1.0}
     index = actor.choice.indices(action)
     assert torch.equal(scores.gather(-1, index.unsqueeze(-1)).squeeze(-1), scores.amax(-1))
-    assert torch.equal(actor.choice.numbers(index), action)
+    assert torch.equal(actor.choice.combinations(x)[index].squeeze(-1), action)
+
+
+def test_an_actor_chooses_the_combination_with_the_largest_score():
+    torch.manual_seed(0)
+    actor = Actor(HalfSpace(dim=4), (16,), choices=3, together=2)
+    tau, x = torch.rand(200, 1), torch.randn(200, 4)
+    action, scores = actor(tau, x), actor.choice.grouped(actor.logits(tau, x))
+    assert scores.shape == (200, 2, 9)
+    index = actor.choice.indices(action)
+    assert torch.equal(scores.gather(-1, index.unsqueeze(-1)).squeeze(-1), scores.amax(-1))
+    pairs = actor.choice.combinations(x)
+    assert pairs.tolist() == [[a, b] for a in (-1.0, 0.0, 1.0) for b in (-1.0, 0.0, 1.0)]
+    assert torch.equal(pairs[index].flatten(1), action)
+
+
+def test_coordinates_together_that_are_refused():
+    with pytest.raises(ArgumentError, match="together: expected a divisor of the number 3 of controls, got 2"):
+        Actor(HalfSpace(dim=3), choices=5, together=2)
+    with pytest.raises(ArgumentError, match="together: expected an integer of at least 1, got 0"):
+        Choice(5, together=0)
 
 
 @pytest.mark.parametrize("choices", [1, 2.5])

@@ -32,7 +32,8 @@ class BestControl(ActorRule):
     corrects such an action.
 
     For an actor that chooses among k numbers, see `pirl_rl.networks.Actor`, these are the levels, and CE is the
-    cross-entropy of its scores, -log softmax(scores)_j for the best level j.
+    cross-entropy of its scores, -log softmax(scores)_j for the best level j. Where it chooses several coordinates
+    together, j is the best of all combinations of their levels, and w_i the range of the Hamiltonian over these.
 
     Where sigma depends on u, E V after one control step takes the place of the Hamiltonian, divided by dt, see
     `pirl_rl.ascent.expected_ahead`: next to faces the Hessian of a network may have the wrong sign. With more than 64
@@ -92,18 +93,18 @@ class BestControl(ActorRule):
 
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
         actor, choice = solution.actor, solution.actor.choice
-        number = choice.choices if choice else self.levels
-        most = self.most_points(solution.problem.controls.dim, number)
+        near = points["state"]
+        levels = choice.combinations(near) if choice else torch.linspace(-1, 1, self.levels).to(near).unsqueeze(-1)
+        most = self.most_points(solution.problem.controls.dim // levels.shape[1], len(levels))
         tau, x = points["tau"][:most], points["state"][:most]
         logits = actor.logits(tau, x)
         with torch.no_grad():
             action = actor.layers[-1](logits)
             objective = self._objective(solution, tau.squeeze(-1), x)
-            levels = torch.linspace(-1, 1, number).to(action)
             best, weight = improved(objective, action, levels, self.inertia)
         if choice:
-            scores = logits.unflatten(-1, (-1, choice.choices))
-            entropy = torch.nn.functional.cross_entropy(scores.movedim(-1, 1), choice.indices(best), reduction="none")
+            scores = choice.grouped(logits).movedim(-1, 1)
+            entropy = torch.nn.functional.cross_entropy(scores, choice.indices(best), reduction="none")
         else:
             # pi = tanh(z) is 2 sigmoid(2 z) - 1, so that 2 z is the logit of (1 + pi)/2.
             entropy = torch.nn.functional.binary_cross_entropy_with_logits(2 * logits, (1 + best) / 2, reduction="none")
@@ -112,9 +113,9 @@ class BestControl(ActorRule):
         mask = points["mask"][:most] if "mask" in points.keys() else torch.ones_like(loss, dtype=torch.bool)
         return -masked_mean(loss, mask)
 
-    def most_points(self, controls: int, levels: int) -> int:
-        """The largest number of points that the budget allows, with so many controls and levels of each."""
-        return max(1, self.budget // (controls * max(1, levels * self.simulated)))
+    def most_points(self, groups: int, levels: int) -> int:
+        """The largest number of points that the budget allows, for so many groups of coordinates with their levels."""
+        return max(1, self.budget // (groups * max(1, levels * self.simulated)))
 
     def _objective(self, solution: Solution, tau: Tensor, x: Tensor) -> Objective:
         if self.steps:

@@ -20,7 +20,7 @@ from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.initial_states import InitialStates, UniformStates
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
-from pirl_rl.switching import control_levels
+from pirl_rl.switching import candidate_controls, control_levels
 
 FINER = 2
 """The shorter control step is this part of that of the training."""
@@ -133,7 +133,7 @@ class Verdict:
         ahead, gain, worst = None, 0.0, 0
         if not isinstance(solution, GridSolution):  # whose policy is the best of its candidates already
             levels = max(LEVELS, control_levels(problem))
-            policy = look_ahead_policy(solution, simulator, 1, levels)
+            policy = look_ahead_policy(solution, simulator, 1, candidate_controls(problem, levels))
             ahead = _difference(play(policy, max(2, self.rollouts // SHARE), few), learned[few])
             gains = largest_residual(solution, tau, x, along := solution.residual(tau, x), levels) - along
             worst = int(gains.argmax())

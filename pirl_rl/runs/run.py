@@ -26,7 +26,7 @@ from pirl_rl.proofs import LowerBound, Settings, UpperBound, prove_limit, prove_
 from pirl_rl.sampling.initial_states import InitialStates
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
-from pirl_rl.switching import LEVELS, control_levels
+from pirl_rl.switching import candidate_controls
 
 Crossing = Literal["bridge", "endpoint"]
 
@@ -81,7 +81,7 @@ class Run:
                 the others with the actor's. The candidate with the largest V at their end is taken, see
                 `pirl_rl.ascent`; with 0, the actor's control is.
             levels: each coordinate of the control has this many candidates, evenly spaced over its range. None takes
-                as many as the physics needs, at least five, see `pirl_rl.switching.control_levels`.
+                as many as the physics needs, at least five, see `pirl_rl.switching.candidate_controls`.
         """
         chosen = levels is None or (isinstance(levels, int) and levels >= 2)
         if not (isinstance(lookahead, int) and lookahead >= 0 and chosen):
@@ -95,12 +95,13 @@ class Run:
             )
         if not lookahead:
             return self._call(self.solution.policy, tau, x)
-        return self._call(look_ahead_policy(self.solution, self.simulator, lookahead, levels or self._levels), tau, x)
+        candidates = self._candidates if levels is None else candidate_controls(self.problem, levels)
+        return self._call(look_ahead_policy(self.solution, self.simulator, lookahead, candidates), tau, x)
 
     @cached_property
-    def _levels(self) -> int:
-        """The number of candidates of each coordinate of the control in a look ahead, which the physics decides."""
-        return max(LEVELS, control_levels(self.problem))
+    def _candidates(self) -> Tensor:
+        """The candidates of a look ahead, which the physics decides."""
+        return candidate_controls(self.problem)
 
     def reach_avoid_set(self, p: float, tau: float) -> Callable:
         """The set {x : V(tau, x) > p}, Eq. (ra_levelset), as a function that maps states (*, n) to (*) bool."""
