@@ -1,4 +1,4 @@
-"""Problems of other kinds than those of the suite, each written as a user would write it."""
+"""Cars, boats and aircraft: headings, obstacles and pursuers."""
 
 from __future__ import annotations
 
@@ -7,37 +7,8 @@ import math
 import torch
 from torch import Tensor
 
+from benchmarks.kinds.shapes import constant, rows
 from pirl_rl import Box, ReachAvoidProblem
-
-
-def rows(*entries: Tensor) -> Tensor:
-    return torch.stack(entries, -1)
-
-
-def constant(x: Tensor, *matrix: list[float]) -> Tensor:
-    """The same matrix (n, w) at all states (*, n)."""
-    sigma = x.new_tensor(matrix)
-    return sigma.expand(*x.shape[:-1], *sigma.shape)
-
-
-class Servo(ReachAvoidProblem):
-    """Bring a motor with dry friction to rest near the middle; noise acts on the speed alone."""
-
-    horizon = 2.5
-    states, controls = Box([-1.5, -2.0], [1.5, 2.0]), Box([-1.5], [1.5])
-
-    def drift(self, x: Tensor, u: Tensor) -> Tensor:
-        speed = x[..., 1]
-        return rows(speed, u[..., 0] - 0.6 * speed - 0.3 * torch.tanh(8 * speed))
-
-    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
-        return constant(x, [0.0], [0.35])
-
-    def target_constraints(self, x: Tensor) -> Tensor:
-        return rows(x[..., 0].abs() - 0.15, x[..., 1].abs() - 0.3)
-
-    def avoid_constraints(self, x: Tensor) -> Tensor:
-        return 1.2 - x[..., :1].abs()
 
 
 class Steering(ReachAvoidProblem):
@@ -77,62 +48,6 @@ class Evader(ReachAvoidProblem):
         return x.norm(dim=-1) - 0.5
 
 
-class Gusty(ReachAvoidProblem):
-    """Reach a disc behind a rock in a box, with noise that grows with the control."""
-
-    horizon = 2.5
-    states, controls = Box([-1.5, -1.5], [1.5, 1.5]), Box([-1.0, -1.0], [1.0, 1.0])
-
-    def drift(self, x: Tensor, u: Tensor) -> Tensor:
-        return u + 0.4 * rows(x[..., 1], -x[..., 0])
-
-    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
-        return torch.diag_embed(0.15 + 0.25 * u.abs())
-
-    def target_level(self, x: Tensor) -> Tensor:
-        return (x - 0.8).norm(dim=-1) - 0.3
-
-    def avoid_level(self, x: Tensor) -> Tensor:
-        return torch.minimum(x.norm(dim=-1) - 0.35, 1.4 - x.abs().amax(-1))
-
-
-class TwoTanks(ReachAvoidProblem):
-    """Keep the levels of two tanks, of which one flows into the other, within bounds; noise grows with the level."""
-
-    objective = "invariance"
-    horizon = 4.0
-    states, controls = Box([0.1, 0.1], [1.0, 1.0]), Box([0.0, 0.0], [0.5, 0.5])
-
-    def drift(self, x: Tensor, u: Tensor) -> Tensor:
-        flow = x.clamp(min=1e-3).sqrt()
-        return u + rows(-0.3 * flow[..., 0], 0.3 * flow[..., 0] - 0.35 * flow[..., 1])
-
-    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
-        return torch.diag_embed(0.05 + 0.2 * x)
-
-    def avoid_constraints(self, x: Tensor) -> Tensor:
-        return torch.cat([x - 0.2, 0.9 - x], -1)
-
-
-class Reservoir(ReachAvoidProblem):
-    """Let a stock with logistic growth and geometric noise recover before it collapses; the control harvests it."""
-
-    horizon = 5.0
-    states, controls = Box([0.0], [3.0]), Box([0.0], [1.0])
-
-    def drift(self, x: Tensor, u: Tensor) -> Tensor:
-        return 0.8 * x * (1 - x / 2) - u * x
-
-    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
-        return (0.35 * x).unsqueeze(-1)
-
-    def target_constraints(self, x: Tensor) -> Tensor:
-        return 2.4 - x
-
-    def avoid_constraints(self, x: Tensor) -> Tensor:
-        return x - 0.3
-
-
 class Slalom(ReachAvoidProblem):
     """Steer a cart of constant speed between two rocks into a disc; the heading is periodic."""
 
@@ -154,25 +69,6 @@ class Slalom(ReachAvoidProblem):
         return (x[..., None, :2] - rocks).norm(dim=-1).amin(-1) - 0.4
 
 
-class Orbit(ReachAvoidProblem):
-    """Come to rest at a station within an hour, in metres and seconds, before a wall on either side."""
-
-    horizon = 3_600.0
-    states, controls = Box([-1e5, -200.0], [1e5, 200.0]), Box([-0.2], [0.2])
-
-    def drift(self, x: Tensor, u: Tensor) -> Tensor:
-        return rows(x[..., 1], u[..., 0])
-
-    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
-        return constant(x, [200.0, 0.0], [0.0, 1.0])
-
-    def target_constraints(self, x: Tensor) -> Tensor:
-        return rows(x[..., 0].abs() - 1e4, x[..., 1].abs() - 30)
-
-    def avoid_constraints(self, x: Tensor) -> Tensor:
-        return 9.5e4 - x[..., :1].abs()
-
-
 class Ring(ReachAvoidProblem):
     """Drive round a ring road, past a block on its inner lane, into a parking lot; radius and periodic angle."""
 
@@ -192,26 +88,6 @@ class Ring(ReachAvoidProblem):
     def avoid_level(self, x: Tensor) -> Tensor:
         block = torch.maximum(math.cos(0.25) - (x[..., 1] - 2).cos(), x[..., 0] - 1.3)
         return torch.minimum(0.45 - (x[..., 0] - 1.25).abs(), block)
-
-
-class VanDerPol(ReachAvoidProblem):
-    """Stop a self-excited oscillation with a weak motor; noise acts on the speed alone."""
-
-    horizon = 6.0
-    states, controls = Box([-2.5, -3.5], [2.5, 3.5]), Box([-0.6], [0.6])
-
-    def drift(self, x: Tensor, u: Tensor) -> Tensor:
-        q, v = x.unbind(-1)
-        return rows(v, (1 - q.square()) * v - q + u[..., 0])
-
-    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
-        return constant(x, [0.0], [0.3])
-
-    def target_level(self, x: Tensor) -> Tensor:
-        return x.norm(dim=-1) - 0.4
-
-    def avoid_constraints(self, x: Tensor) -> Tensor:
-        return 2.4 - x[..., :1].abs()
 
 
 class TwoHarbours(ReachAvoidProblem):
@@ -278,26 +154,6 @@ class Loiter(ReachAvoidProblem):
         return torch.minimum(radius - 0.4, 1.5 - radius)
 
 
-class Crosswind(ReachAvoidProblem):
-    """Bring a mass to rest between two walls in a wind that nobody controls, and which alone has noise."""
-
-    horizon = 2.5
-    states, controls = Box([-1.5, -1.5, -1.0], [1.5, 1.5, 1.0]), Box([-1.0], [1.0])
-
-    def drift(self, x: Tensor, u: Tensor) -> Tensor:
-        _, speed, wind = x.unbind(-1)
-        return rows(speed, u[..., 0] + wind, -0.8 * wind)
-
-    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
-        return constant(x, [0.0], [0.0], [0.5])
-
-    def target_constraints(self, x: Tensor) -> Tensor:
-        return rows(x[..., 0].abs() - 0.2, x[..., 1].abs() - 0.3)
-
-    def avoid_constraints(self, x: Tensor) -> Tensor:
-        return 1.3 - x[..., :1].abs()
-
-
 class Bicycle(ReachAvoidProblem):
     """Park a car that also drives backwards; a steering angle turns it by as much as its speed allows."""
 
@@ -319,7 +175,21 @@ class Bicycle(ReachAvoidProblem):
         return (x[..., :2] - x.new_tensor([0.9, 0.6])).norm(dim=-1) - 0.35
 
 
-KINDS: tuple[type[ReachAvoidProblem], ...] = (Servo, Steering, Evader, Gusty, TwoTanks, Reservoir, Slalom, Orbit, Ring)
-KINDS += (VanDerPol, TwoHarbours, River, Loiter, Crosswind, Bicycle)
+class TwoCars(ReachAvoidProblem):
+    """Keep away from a car that drives straight on; the states are its place and its heading as seen from ours."""
 
-PROBLEMS = {kind.__name__: kind for kind in KINDS}
+    objective = "invariance"
+    horizon = 3.0
+    states = Box([-2.5, -2.0, -math.pi], [2.5, 2.0, math.pi], periodic=[2])
+    controls = Box([-1.5], [1.5])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        ahead, aside, heading = x.unbind(-1)
+        turn = u[..., 0]
+        return rows(-0.8 + heading.cos() + turn * aside, heading.sin() - turn * ahead, -turn)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return constant(x, [0.2, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 0.2])
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        return x[..., :2].norm(dim=-1) - 0.5
