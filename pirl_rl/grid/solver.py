@@ -8,7 +8,7 @@ tau is small.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -38,6 +38,10 @@ ITERATIONS = 50
 
 LEAST_FRACTION = 0.05
 """V is continued into A and B along arms at least this long, as the slope along shorter ones is mostly rounding."""
+
+
+Level = tuple[int, np.ndarray, np.ndarray]
+"""The number of a time to go, V (N,) at all nodes, and the numbers (M,) of the best candidates."""
 
 
 class GridSolver:
@@ -113,7 +117,6 @@ class GridSolver:
         free = np.flatnonzero(~inside)
         controls = candidates(problem, nodes[free], mesh.spacing, self.levels)
         steps, split = self._scheme(mesh, nodes[free], controls) if scheme is None else scheme
-        dt = problem.horizon / steps
         chain = Chain(problem, mesh, free, controls[:1] if split else controls, moves=not split)
         value = problem.boundary_value(torch.from_numpy(nodes[free])).numpy()
         if not (value.any() or any(arm.value.any() for pair in chain.axes for arm in pair)):
@@ -121,24 +124,14 @@ class GridSolver:
         continued = _Continuation(mesh, free, fixed, chain, bounded=split)
         values = np.empty((steps + 1, mesh.size), np.float32)
         policies = np.empty((steps + 1, len(free)), np.min_scalar_type(len(controls)))
-        shares = np.linspace(0, 1, steps + 1) ** 2
         values[0] = continued(value)
         if split:
-            # Equal steps have the same paths; V is noted at the times of all solutions.
-            transport = Transport(problem, mesh, nodes[free], controls, dt)
-            after, policy = values[0], np.zeros(len(free), int)
-            for step in range(steps):
-                before, (moved, policy) = after, transport(after, policy)
-                value = _solve(chain, moved, moved, np.zeros_like(policy), dt)
-                after, within = continued(value), steps * shares - step
-                for level in np.flatnonzero((within > 0) & (within <= 1)):
-                    values[level] = (1 - within[level]) * before + within[level] * after
-                    policies[level] = policy
+            transport = Transport(problem, mesh, nodes[free], controls, problem.horizon / steps)
+            march = _in_turns(chain, transport, continued, value, problem.horizon, steps)
         else:
-            policy = np.zeros(len(free), int)
-            for step, share in enumerate(np.diff(shares), start=1):
-                value, policy = _advance(chain, value, policy, problem.horizon * share)
-                values[step], policies[step] = continued(value), policy
+            march = _together(chain, continued, value, problem.horizon, steps)
+        for level, field, policy in march:
+            values[level], policies[level] = field, policy
         policies[0] = policies[1]
         place = np.full(mesh.size, -1)
         place[free] = np.arange(len(free))
@@ -155,6 +148,30 @@ class GridSolver:
         needed = math.ceil(self.problem.horizon / longest_step(self.problem, mesh, x, controls))
         most = MOST_STEPS * steps if self.steps is None else steps
         return (max(steps, needed), True) if needed <= most else (steps, False)
+
+
+def _together(chain: Chain, continued: _Continuation, value: np.ndarray, horizon: float, steps: int) -> Iterator[Level]:
+    """Steps in which drift and noise act at once, from V (M,) at tau = 0: equal ones in sqrt(tau)."""
+    policy = np.zeros(len(value), int)
+    for level, share in enumerate(np.diff(np.linspace(0, 1, steps + 1) ** 2), start=1):
+        value, policy = _advance(chain, value, policy, horizon * share)
+        yield level, continued(value), policy
+
+
+def _in_turns(
+    chain: Chain, transport: Transport, continued: _Continuation, value: np.ndarray, horizon: float, steps: int
+) -> Iterator[Level]:
+    """Steps in which drift and noise act in turns, from V (M,) at tau = 0.
+
+    Their lengths are equal, so that their paths are the same. V is noted at the times of all solutions.
+    """
+    after, policy, times = continued(value), np.zeros(len(value), int), steps * np.linspace(0, 1, steps + 1) ** 2
+    for step in range(steps):
+        before, (moved, policy) = after, transport(after, policy)
+        after = continued(_solve(chain, moved, moved, np.zeros_like(policy), horizon / steps))
+        within = times - step
+        for level in np.flatnonzero((within > 0) & (within <= 1)):
+            yield int(level), (1 - within[level]) * before + within[level] * after, policy
 
 
 def _advance(chain: Chain, before: np.ndarray, policy: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
