@@ -11,7 +11,7 @@ from pirl_rl.errors import ArgumentError, ConfigError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
 from pirl_rl.structure import check_problem, noise_channels
-from pirl_rl.switching import control_levels, coordinates_together, jumps_over_worse_controls
+from pirl_rl.switching import control_levels, coordinates_together
 from pirl_rl.time_steps import check_time_steps, propose_time_steps
 
 AUTO = "auto"
@@ -89,8 +89,9 @@ def choose_updates(config: DictConfig, problem: ReachAvoidProblem) -> None:
 def choose_choices(config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[str] = ()) -> None:
     """Replace `auto` in actor.choices and actor.together by numbers that follow from the problem.
 
-    There are choices where the best control jumps over worse ones, and else none, see `pirl_rl.switching`. Where a rule
-    of the run, or of one of its stages, needs the gradient of the policy, there are none either.
+    There are choices where the Hamiltonian is not affine in the control, see `pirl_rl.switching`. There are none where
+    a rule of the run, or of one of its stages, needs the gradient of the policy, or looks ahead: a control that is held
+    for long cannot make up for a coarse level by switching to the next.
 
     Args:
         config: the configuration of a run.
@@ -100,25 +101,27 @@ def choose_choices(config: DictConfig, problem: ReachAvoidProblem, trust: Sequen
     if not isinstance(config.actor, DictConfig):
         return
     if config.actor.get("choices") == AUTO:
-        config.actor.choices = control_levels(problem) if _jumps(config, problem, trust) else None
+        levels = control_levels(problem)
+        config.actor.choices = levels if levels > 2 and _all_suit_choices(config, trust) else None
     if config.actor.get("together") == AUTO:
         choices = config.actor.get("choices")
         config.actor.together = coordinates_together(problem, choices) if isinstance(choices, int) else 1
 
 
-def _jumps(config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[str]) -> bool:
-    """Whether the policy should jump, and all actor rules of the run and its stages can train one that does."""
+def _all_suit_choices(config: DictConfig, trust: Sequence[str]) -> bool:
+    """Whether all actor rules of the run and its stages can train an actor that chooses, and do not look ahead."""
     stages = config.get("stages")
     of_stages = [f"stages[{i}].actor_rule" for i in range(len(stages) if isinstance(stages, ListConfig) else 0)]
     rules = ["loss.actor_rule", *(key for key in of_stages if OmegaConf.select(config, key) is not None)]
-    trains = all(_trains_choices(config, f"{key}._target_", trust) for key in rules)
-    return trains and jumps_over_worse_controls(problem)
+    return all(_suits_choices(config, key, trust) for key in rules)
 
 
-def _trains_choices(config: DictConfig, key: str, trust: Sequence[str]) -> bool:
+def _suits_choices(config: DictConfig, key: str, trust: Sequence[str]) -> bool:
     """Whether the class of an actor rule says that it trains choices; `Sum` knows that only of the rules it holds."""
-    target = OmegaConf.select(config, key)
-    return target is not None and getattr(resolve(target, key, trust), "trains_choices", None) is True
+    target = OmegaConf.select(config, f"{key}._target_")
+    if target is None or OmegaConf.select(config, f"{key}.steps"):
+        return False
+    return getattr(resolve(target, f"{key}._target_", trust), "trains_choices", None) is True
 
 
 def choose_paths(config: DictConfig, problem: ReachAvoidProblem, simulator: Simulator) -> None:

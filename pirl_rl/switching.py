@@ -1,10 +1,10 @@
 """How the best control changes with the direction of grad V, and what follows for the choice of controls.
 
 The control that is best at a state maximises p . f(x, u) for p = grad V. Along a line of directions p it changes, in
-small steps or by jumps. Where the drift is affine in u, all controls between the old and the new one are as good at the
-moment of a jump. Where it is not, those between may be worse. A heading of pi is one of -pi, and all others lie between
-them. To turn a car, forwards to the left is as good as backwards to the right, and to stand still is worse. A policy
-that is continuous in the state passes through these controls; one that chooses among levels jumps over them.
+small steps or by jumps. Where the drift is affine in u it jumps between bounds, in one coordinate after the other, and
+all controls between are as good at the moment of the jump. Where it is not, the best control may lie between the
+bounds, those between an old and a new one may be worse, and several coordinates may jump at once. A heading of pi is
+one of -pi, and all others lie between them. To turn a car, forwards to the left is as good as backwards to the right.
 """
 
 from __future__ import annotations
@@ -15,17 +15,19 @@ import torch
 from torch import Tensor
 
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.structure import has_controlled_noise, is_control_affine
+from pirl_rl.structure import is_control_affine
 
 LEVELS, FINE_LEVELS = 5, 33
 """The numbers of levels of a control where two, its bounds, do not hold the best one, and where five are too few."""
 
-JUMPS = 0.25
-"""The share of jumps over worse controls from which a policy should jump, and that of jumps in several coordinates from
-which it should choose these together."""
-
 COARSE = 0.005
 """What `LEVELS` may lose against the best control, as a share of the range of p . f, before they are too few."""
+
+JOINT = 0.25
+"""The share of jumps in several coordinates of the control from which these are chosen together."""
+
+MOST_COMBINATIONS = 125
+"""The largest number of combinations of the levels of all coordinates among which a policy chooses."""
 
 POINTS, TURNS = 128, 129
 """The numbers of states, and of directions p on a line at each of them."""
@@ -36,50 +38,31 @@ MARKS = 17
 TOGETHER = 2
 """The largest number of coordinates of u that change together; the others are drawn at random."""
 
-MOST_COMBINATIONS = 125
-"""The largest number of combinations of the levels of all coordinates among which a policy chooses."""
-
 FAR = 4
 """The least number of levels in a coordinate that makes a change of the best control a jump."""
-
-WORSE = 0.1
-"""The share of the range of p . f by which the middle of a jump is worse than its end, for the jump to count."""
 
 
 class Switching(NamedTuple):
     """How the best control changes.
 
     Attributes:
-        jumps: the share of the jumps that lead over worse controls; 0 where there is no jump.
-        joint: the share of the jumps that change several coordinates of the control at once.
+        joint: the share of the jumps that change several coordinates of the control at once; 0 where there is no jump.
         coarseness: the mean of what `LEVELS` levels lose against `MARKS`, as a share of the range of p . f.
     """
 
-    jumps: float
     joint: float
     coarseness: float
-
-
-def jumps_over_worse_controls(problem: ReachAvoidProblem) -> bool:
-    """Whether the best control jumps from one good control to another with worse ones between them.
-
-    So it does where sigma depends on u, since the worst control may have the least noise or the most, and where
-    `switching` finds it for the drift.
-    """
-    return has_controlled_noise(problem) or switching(problem).jumps > JUMPS
 
 
 def control_levels(problem: ReachAvoidProblem) -> int:
     """The number of levels of each coordinate of the control, bounds included, one of which is nearly the best.
 
-    Where the Hamiltonian is affine in u, it has its maximum at the bounds. Else the maximum may lie between them. Where
-    it jumps over worse controls, and may lie anywhere, as that of a heading, few levels would be too coarse for the
-    policy, which takes one of them.
+    Where the Hamiltonian is affine in u, it has its maximum at the bounds. Else the maximum may lie between them, and
+    few levels may be too coarse, as they are for a heading.
     """
     if is_control_affine(problem):
         return 2
-    found = switching(problem)
-    return FINE_LEVELS if found.jumps > JUMPS and found.coarseness > COARSE else LEVELS
+    return FINE_LEVELS if switching(problem).coarseness > COARSE else LEVELS
 
 
 def coordinates_together(problem: ReachAvoidProblem, levels: int) -> int:
@@ -95,7 +78,7 @@ def coordinates_together(problem: ReachAvoidProblem, levels: int) -> int:
     """
     m = problem.controls.dim
     few = m > 1 and levels**m <= MOST_COMBINATIONS
-    return m if few and switching(problem).joint > JUMPS else 1
+    return m if few and switching(problem).joint > JOINT else 1
 
 
 def candidate_controls(problem: ReachAvoidProblem, levels: int | None = None) -> Tensor:
@@ -127,19 +110,14 @@ def switching(problem: ReachAvoidProblem, seed: int = 0) -> Switching:
     share = torch.linspace(0, 1, TURNS, dtype=x.dtype).unsqueeze(-1)
     score = ((1 - share) * one + share * other) @ drift.mT  # (POINTS, TURNS, K)
     top, best = score.max(-1)
-    spread = (top - score.amin(-1)).mean(1, keepdim=True).clamp(min=1e-12)
 
-    before, after = levels[best[:, :-1]], levels[best[:, 1:]]
-    far = (before - after).abs() >= FAR
-    jumped = far.any(-1)
-    base = MARKS ** torch.arange(levels.shape[1] - 1, -1, -1)
-    middle = score[:, 1:].gather(2, (base * ((before + after) // 2)).sum(-1, keepdim=True)).squeeze(-1)
-    worse = jumped & ((top[:, 1:] - middle) / spread > WORSE)
+    far = (levels[best[:, 1:]] - levels[best[:, :-1]]).abs() >= FAR
+    joint = (far.sum(-1) > 1).sum() / far.any(-1).sum().clamp(min=1)
 
     few = (levels % ((MARKS - 1) // (LEVELS - 1)) == 0).all(-1)
+    spread = (top - score.amin(-1)).mean(1, keepdim=True).clamp(min=1e-12)
     lost = (top - score[..., few].amax(-1)) / spread
-    jumps, joint = ((kind.sum() / jumped.sum().clamp(min=1)).item() for kind in (worse, far.sum(-1) > 1))
-    return Switching(jumps, joint, lost.mean().item())
+    return Switching(joint.item(), lost.mean().item())
 
 
 def _trials(m: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
