@@ -28,9 +28,9 @@ MESHES = ((Reach1D(), (101, 201, 401)), (Exit1D(), (101, 201, 401)))
 MESHES += ((HalfSpace(dim=2), (41, 81, 121)), (RadialExit(dim=2), (41, 81, 121)))
 
 
-def states(problem, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+def states(problem, count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     """Random states outside A and B, with times to go in the second half of the horizon."""
-    rng = torch.Generator().manual_seed(0)
+    rng = torch.Generator().manual_seed(seed)
     x = problem.states.sample(4 * count, rng, torch.float64)
     x = x[problem.interior(x)][:count]
     return problem.horizon * (0.5 + 0.5 * torch.rand(len(x), generator=rng, dtype=x.dtype)), x
@@ -58,11 +58,14 @@ def closed_forms() -> list[dict[str, Any]]:
 
 
 def dubins(points: int, rollouts: int = 2_000) -> None:
-    """Print V against Monte Carlo of the grid's own policy at 50 states."""
+    """Print V against Monte Carlo of the grid's own policy at 50 states.
+
+    V is that of a control that is never held, so that Monte Carlo holds it for a two-thousandth of the horizon.
+    """
     problem, started = DubinsCar(), time.perf_counter()
     solution = GridSolver(problem, points).solve()
     seconds, (tau, x) = time.perf_counter() - started, states(DubinsCar(), 50)
-    played = monte_carlo(problem, solution.policy, tau, x, rollouts=rollouts, dt=0.01)
+    played = monte_carlo(problem, solution.policy, tau, x, rollouts=rollouts, dt=problem.horizon / 2_000)
     value = solution.value(tau, x)
     distance = (value - played.probability).abs()
     # The standard error if V is right: that of Monte Carlo's own estimate is 0 where no path, or every path, succeeds.
@@ -74,11 +77,11 @@ def dubins(points: int, rollouts: int = 2_000) -> None:
     print(f"share of the states within three standard errors {(distance <= 3 * noise).double().mean():.2f}")
 
 
-def against(run_dir: str, points: int, steps: int | None, rollouts: int = 400, count: int = 400) -> None:
+def against(run_dir: str, points: int, steps: int | None, seed: int, rollouts: int = 400, count: int = 400) -> None:
     """Print the mean success of a run's policy and of the grid's, at the same states and with the same noise."""
     run = load_run(run_dir)
     problem, simulator = run.problem, run.simulator
-    solution, (tau, x) = GridSolver(problem, points, steps).solve(), states(problem, count)
+    solution, (tau, x) = GridSolver(problem, points, steps).solve(), states(problem, count, seed)
     clock = {"dt": simulator.dt, "substeps": simulator.substeps, "crossing": simulator.crossing}
     for name, policy in (("run", run.solution.policy), ("grid", solution.policy)):
         played = monte_carlo(problem, policy, tau, x, rollouts=rollouts, **clock)
@@ -96,10 +99,11 @@ if __name__ == "__main__":
         "--steps", type=int, help="steps in time to go, with --run; by default they follow from the problem"
     )
     parser.add_argument("--run", help="compare the policy of this run directory with the grid's")
+    parser.add_argument("--seed", type=int, default=0, help="of the states, with --run")
     parser.add_argument("--json", type=Path, help="write what is found in one and two dimensions to this file")
     arguments = parser.parse_args()
     if arguments.run:
-        against(arguments.run, arguments.points, arguments.steps)
+        against(arguments.run, arguments.points, arguments.steps, arguments.seed)
     elif arguments.dubins:
         dubins(arguments.points)
     else:
