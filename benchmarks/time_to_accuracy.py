@@ -1,10 +1,11 @@
 """How long the default recipe trains until V is as near to the truth as some bounds, beside the time of the grid.
 
     python benchmarks/time_to_accuracy.py [--problems reach1d zermelo ...] [--seeds 0 1 2] [--every 50] [--states 400]
-        [--updates N] [--json FILE]
+        [--updates N] [--warm] [--json FILE]
 
-Each run is a process of its own with one thread and an empty cache of compiled programs, and trains with the settings
-of `+experiment=...` to the end, without evaluations, checkpoints and the check of the problem. After every 50 updates
+Each run is a process of its own with one thread and an empty cache of compiled programs; with `--warm` a short run of
+the same problem has filled the cache, as any earlier run on the machine does. A run trains with the settings of
+`+experiment=...` to the end, without evaluations, checkpoints and the check of the problem. After every 50 updates
 the mean square of V minus the truth is taken at the same 400 states, while the clocks stand still. A bound is reached
 at the first of these updates at which the error is below it.
 
@@ -48,6 +49,9 @@ CHOSEN += ("pendulum", "zermelo")
 """The one-dimensional problem of the paper, and the problems of the suite in two dimensions."""
 
 PLAIN = ("device=cpu", "logger=none", "trainer.evaluate_every=0", "evaluation.during=[]", "evaluation.final=[]")
+
+WARM_UP = 60
+"""The number of updates of the run that fills the cache."""
 
 CLOCKS = ("seconds", "processor")
 
@@ -120,12 +124,14 @@ def error(trainer: Trainer, truth: Truth) -> float:
     return (trainer.solution.value(truth.tau, truth.x).double() - truth.value).square().mean().item()
 
 
-def train_apart(name: str, settings: list[str], truth: Truth, every: int) -> dict[str, Any]:
-    """`train` in a new process, with an empty cache of compiled programs."""
+def train_apart(name: str, settings: list[str], truth: Truth, every: int, warm: bool) -> dict[str, Any]:
+    """`train` in a new process, with an empty cache of compiled programs, or one that a short run has filled."""
     with tempfile.TemporaryDirectory() as folder:
-        os.environ["TORCHINDUCTOR_CACHE_DIR"] = folder  # the new process inherits it
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-            return pool.submit(train, name, settings, truth, every, time.monotonic()).result()
+        os.environ["TORCHINDUCTOR_CACHE_DIR"] = folder  # the new processes inherit it
+        for more in [[f"trainer.updates={WARM_UP}"]] * warm + [[]]:
+            with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+                run = pool.submit(train, name, [*settings, *more], truth, every, time.monotonic()).result()
+    return run
 
 
 def reached(run: dict[str, Any], bound: float) -> dict[str, float] | None:
@@ -195,6 +201,7 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=50)
     parser.add_argument("--states", type=int, default=400)
     parser.add_argument("--updates", type=int, help="of each run; those of the recipe by default")
+    parser.add_argument("--warm", action="store_true", help="fill the cache of compiled programs before each run")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -203,7 +210,10 @@ def main() -> None:
     lines, rows, curves = [f"| {' | '.join(head)} |", f"|---|{'--:|' * (len(head) - 1)}"], [], []
     for name in arguments.problems:
         truth = find_truth(make_problem(compose("train", [*PROBLEMS[name]])), arguments.states, STATES_SEED)
-        runs = [train_apart(name, [*settings, f"seed={seed}"], truth, arguments.every) for seed in arguments.seeds]
+        apart = [
+            (name, [*settings, f"seed={seed}"], truth, arguments.every, arguments.warm) for seed in arguments.seeds
+        ]
+        runs = [train_apart(*run) for run in apart]
         curves += runs
         rows += summarise(name, runs, truth)
         save(arguments.json, ratios(rows), rows=rows, runs=curves)
