@@ -20,7 +20,7 @@ from pirl_rl.structure import is_control_affine
 LEVELS, FINE_LEVELS = 5, 33
 """The numbers of levels of a control where two, its bounds, do not hold the best one, and where five are too few."""
 
-COARSE = 0.005
+COARSE = 0.001
 """What `LEVELS` may lose against the best control, as a share of the range of p . f, before they are too few."""
 
 JOINT = 0.25

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from benchmarks.kinds import Bicycle, Loiter, TwoHarbours
+from benchmarks.kinds import Bicycle, Loiter, Sprint, TwoHarbours
 from pirl_rl import Box, ReachAvoidProblem
 from pirl_rl.actor_rules import BestControl, Hamiltonian
 from pirl_rl.ascent import (
@@ -372,6 +372,7 @@ def test_levels_of_a_control(problem, levels):
     [
         *((Steered(), False, False), (VehicleDrift(), False, False), (VehicleDrift3(), False, True)),
         *((Bicycle(), True, False), (TwoHarbours(), False, True), (Loiter(), False, True)),
+        (Sprint(), False, True),
     ],
     ids=lambda value: type(value).__name__,
 )

@@ -124,3 +124,23 @@ class Crosswind(ReachAvoidProblem):
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
         return 1.3 - x[..., :1].abs()
+
+
+class Sprint(ReachAvoidProblem):
+    """Run to a line before the strength is spent, which falls with the square of the speed and grows at rest."""
+
+    horizon = 3.0
+    states, controls = Box([0.0, 0.0], [2.0, 1.0]), Box([0.0], [2.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        speed = u[..., 0]
+        return rows(speed - 0.3, 0.25 - 0.5 * speed.square())
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return constant(x, [0.25, 0.0], [0.0, 0.15])
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return rows(1.7 - x[..., 0], 0.02 - x[..., 1])
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        return x[..., 1:]

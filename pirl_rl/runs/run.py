@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from functools import cached_property
 from numbers import Real
 from pathlib import Path
 from typing import Any, Literal
@@ -53,6 +52,7 @@ class Run:
     def __init__(self, solution: Solution, config: DictConfig, update: int, trust: Sequence[str] = ()):
         self.solution, self.config, self.update, self._trust = solution, config, update, trust
         self.simulator = make_simulator(config, solution.problem)
+        self._candidates: dict[int | None, Tensor] = {}  # of a look ahead, by the number of levels
 
     @property
     def problem(self) -> ReachAvoidProblem:
@@ -95,13 +95,11 @@ class Run:
             )
         if not lookahead:
             return self._call(self.solution.policy, tau, x)
-        candidates = self._candidates if levels is None else candidate_controls(self.problem, levels)
-        return self._call(look_ahead_policy(self.solution, self.simulator, lookahead, candidates), tau, x)
-
-    @cached_property
-    def _candidates(self) -> Tensor:
-        """The candidates of a look ahead, which the physics decides."""
-        return candidate_controls(self.problem)
+        # The candidates follow from samples of the physics, which a control loop should not draw in each step.
+        if levels not in self._candidates:
+            self._candidates[levels] = candidate_controls(self.problem, levels)
+        ahead = look_ahead_policy(self.solution, self.simulator, lookahead, self._candidates[levels])
+        return self._call(ahead, tau, x)
 
     def reach_avoid_set(self, p: float, tau: float) -> Callable:
         """The set {x : V(tau, x) > p}, Eq. (ra_levelset), as a function that maps states (*, n) to (*) bool."""
