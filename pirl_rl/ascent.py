@@ -100,7 +100,8 @@ def continued_value(solution: Solution, tau: Tensor, x: Tensor) -> Tensor:
         y = torch.where(failed.unsqueeze(-1), _mirrored(problem.avoid_level, x), y)
     if problem.objective == "reach-avoid":
         y = torch.where(reached.unsqueeze(-1), _mirrored(lambda z: problem.reached_constraints(z).amax(-1), x), y)
-    value = solution.value(tau, y)
+    # Networks take one axis of points: stacked critics have an axis of their own before it.
+    value = solution.value(tau.flatten(), y.flatten(0, -2)).reshape(tau.shape)
     return torch.where(reached, 2 - value, torch.where(failed, -value, value))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pirl_rl.errors import ArgumentError
 from pirl_rl.networks import Actor, Critic, CriticValue
 from pirl_rl.operators import generator
 from pirl_rl.problem import ReachAvoidProblem
@@ -112,6 +113,11 @@ class Solution:
             return torch.stack(columns, -1)
 
     def _own(self, tau: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        # With more axes the mean over the critics would be one over points, since critics have an axis before these.
+        if x.ndim != 2 or tau.shape != x.shape[:1]:
+            raise ArgumentError(
+                f"x: expected states (N, n) and times to go (N,), got {(*x.shape,)} and {(*tau.shape,)}"
+            )
         return tau.to(self.dtype), self.problem.states.wrap(x.to(self.dtype))
 
     def _critics(self, tau: Tensor, x: Tensor) -> CriticValue:

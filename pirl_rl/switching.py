@@ -1,10 +1,11 @@
 """How the best control changes with the direction of grad V, and what follows for the choice of controls.
 
-The control that is best at a state maximises p . f(x, u) for p = grad V. Along a line of directions p it changes, in
-small steps or by jumps. Where the drift is affine in u it jumps between bounds, in one coordinate after the other, and
-all controls between are as good at the moment of the jump. Where it is not, the best control may lie between the
-bounds, those between an old and a new one may be worse, and several coordinates may jump at once. A heading of pi is
-one of -pi, and all others lie between them. To turn a car, forwards to the left is as good as backwards to the right.
+The control that is best at a state maximises the Hamiltonian, p . f(x, u) for p = grad V, and Tr(sigma sigma^T M)/2 for
+M = hess V where sigma depends on u. Along a line of directions p and M it changes, in small steps or by jumps. Where
+the drift is affine in u it jumps between bounds, in one coordinate after the other, and all controls between are as
+good at the moment of the jump. Where it is not, the best control may lie between the bounds, those between an old and a
+new one may be worse, and several coordinates may jump at once. A heading of pi is one of -pi, and all others lie
+between them. To turn a car, forwards to the left is as good as backwards to the right.
 """
 
 from __future__ import annotations
@@ -15,19 +16,22 @@ import torch
 from torch import Tensor
 
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.structure import is_control_affine
+from pirl_rl.structure import has_controlled_noise, is_control_affine
 
 LEVELS, FINE_LEVELS = 5, 33
 """The numbers of levels of a control where two, its bounds, do not hold the best one, and where five are too few."""
 
-COARSE = 0.001
-"""What `LEVELS` may lose against the best control, as a share of the range of p . f, before they are too few."""
+COARSE = 0.0005
+"""What `LEVELS` may lose on average, as a share of the range of the Hamiltonian, before they are too few."""
 
 JOINT = 0.25
 """The share of jumps in several coordinates of the control from which these are chosen together."""
 
 MOST_COMBINATIONS = 125
 """The largest number of combinations of the levels of all coordinates among which a policy chooses."""
+
+CURVATURE = 1.5
+"""The curvature of V beside its slope, with states counted in half widths of their box."""
 
 POINTS, TURNS = 128, 129
 """The numbers of states, and of directions p on a line at each of them."""
@@ -47,7 +51,7 @@ class Switching(NamedTuple):
 
     Attributes:
         joint: the share of the jumps that change several coordinates of the control at once; 0 where there is no jump.
-        coarseness: the mean of what `LEVELS` levels lose against `MARKS`, as a share of the range of p . f.
+        coarseness: the mean of what `LEVELS` levels lose against `MARKS`, as a share of the range of the Hamiltonian.
     """
 
     joint: float
@@ -95,20 +99,18 @@ def candidate_controls(problem: ReachAvoidProblem, levels: int | None = None) ->
 
 
 def switching(problem: ReachAvoidProblem, seed: int = 0) -> Switching:
-    """How the best control changes along lines of directions p, at random states, for the drift alone.
+    """How the best control changes along lines of directions, at random states.
 
     Args:
         problem: the physics.
         seed: of states, controls and directions.
     """
-    rng, n = torch.Generator().manual_seed(seed), problem.states.dim
+    rng, curved = torch.Generator().manual_seed(seed), has_controlled_noise(problem)
     x = problem.states.sample(POINTS, rng, torch.float64)
     levels, action = _trials(problem.controls.dim, rng)
-    y = x[:, None].expand(-1, len(levels), -1)
-    drift = problem.drift(y, problem.controls.denormalize(action)) / problem.states.center_and_half_width(x)[1]
-    one, other = (torch.randn(POINTS, 1, n, generator=rng, dtype=x.dtype) for _ in range(2))
-    share = torch.linspace(0, 1, TURNS, dtype=x.dtype).unsqueeze(-1)
-    score = ((1 - share) * one + share * other) @ drift.mT  # (POINTS, TURNS, K)
+    y, u = x[:, None].expand(-1, len(levels), -1), problem.controls.denormalize(action)
+    one, other = (_hamiltonian(problem, y, u, rng, curved).unsqueeze(1) for _ in range(2))
+    score = torch.lerp(one, other, torch.linspace(0, 1, TURNS, dtype=x.dtype).unsqueeze(-1))  # (POINTS, TURNS, K)
     top, best = score.max(-1)
 
     far = (levels[best[:, 1:]] - levels[best[:, :-1]]).abs() >= FAR
@@ -118,6 +120,27 @@ def switching(problem: ReachAvoidProblem, seed: int = 0) -> Switching:
     spread = (top - score.amin(-1)).mean(1, keepdim=True).clamp(min=1e-12)
     lost = (top - score[..., few].amax(-1)) / spread
     return Switching(joint.item(), lost.mean().item())
+
+
+def _hamiltonian(problem: ReachAvoidProblem, y: Tensor, u: Tensor, rng: torch.Generator, curved: bool) -> Tensor:
+    """The Hamiltonian (N, K) of a random gradient at each of N states y (N, K, n), with controls (N, K, m).
+
+    Where sigma depends on the control, it has the term of a random Hessian with one rise and one fall. States are
+    counted in half widths of their box.
+    """
+    width = problem.states.center_and_half_width(y)[1]
+    gradient, up, down = (torch.randn(len(y), 1, y.shape[-1], generator=rng, dtype=y.dtype) for _ in range(3))
+    value = (problem.drift(y, u) / width * gradient).sum(-1)
+    if curved:
+        rows = zip(y, u, up, down, strict=True)  # one state at a time, since sigma may have many entries
+        value = value + CURVATURE / 2 * torch.stack([_bend(problem, *row, width) for row in rows])
+    return value
+
+
+def _bend(problem: ReachAvoidProblem, y: Tensor, u: Tensor, up: Tensor, down: Tensor, width: Tensor) -> Tensor:
+    """Tr(sigma sigma^T (up up^T - down down^T)) (K,) at states y (K, n)."""
+    sigma = problem.diffusion(y, u) / width.unsqueeze(-1)
+    return (up @ sigma).square().sum((-2, -1)) - (down @ sigma).square().sum((-2, -1))
 
 
 def _trials(m: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:

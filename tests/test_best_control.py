@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from benchmarks.kinds import Bicycle, Loiter, Sprint, TwoHarbours
+from benchmarks.kinds import Bicycle, Gusty, Investor, Loiter, Sprint, TwoHarbours
 from pirl_rl import Box, ReachAvoidProblem
 from pirl_rl.actor_rules import BestControl, Hamiltonian
 from pirl_rl.ascent import (
@@ -168,6 +168,28 @@ def test_noise_beside_a_face_is_not_preferred():
     objective = expected_ahead(Straight(), torch.ones(5), x, 0.05)  # type: ignore[arg-type]
     still, noisy = (objective(torch.full((5, 1), action)) for action in (-1.0, 1.0))
     assert torch.allclose(still, noisy, atol=1e-6)
+
+
+@pytest.mark.parametrize("critics", [1, 2])
+def test_several_actions_at_once_have_the_values_of_each_of_them_beside_faces(critics):
+    """The ends of a step beside a face lie on both of its sides, so that each must have the value of its own place."""
+    problem = Gusty()
+    one = solution_of(problem)
+    solution = Solution(problem, one.actor, stack([Critic(problem) for _ in range(critics)]))
+    x = problem.states.sample(2_000, torch.Generator().manual_seed(5))
+    level = torch.minimum(problem.avoid_level(x), problem.target_level(x)).abs()
+    x = x[problem.interior(x)][level[problem.interior(x)] < 0.05]
+    tau, actions = torch.full((len(x),), 0.5), 2 * torch.rand(3, 2, len(x), 2) - 1
+    objective = expected_ahead(solution, tau, x, 0.05)
+    found, u, h = objective(actions), problem.controls.denormalize(actions), 0.05
+    for i, j in itertools.product(range(3), range(2)):
+        mean, sigma = x + h * problem.drift(x, u[i, j]), problem.diffusion(x, u[i, j])
+        ends = [mean + side * math.sqrt(2 * h) * sigma[..., k] for k in range(2) for side in (1, -1)]
+        expected = torch.stack([continued_value(solution, tau - h, end) for end in ends]).mean(0)
+        assert torch.allclose(found[i, j], expected, atol=1e-6)
+        assert torch.allclose(objective(actions[i, j]), expected, atol=1e-6)
+    with pytest.raises(ArgumentError, match=r"x: expected states \(N, n\) and times to go \(N,\), got \(4, 7, 2\)"):
+        solution.value(torch.ones(4, 7), torch.zeros(4, 7, 2))
 
 
 @pytest.mark.parametrize(("problem", "levels", "cubature"), [(Reach1D(), 2, False), (Steered(True), 5, True)])
@@ -372,12 +394,16 @@ def test_levels_of_a_control(problem, levels):
     [
         *((Steered(), False, False), (VehicleDrift(), False, False), (VehicleDrift3(), False, True)),
         *((Bicycle(), True, False), (TwoHarbours(), False, True), (Loiter(), False, True)),
-        (Sprint(), False, True),
+        *((Sprint(), False, True), (Gusty(), False, False), (Investor(), False, True)),
     ],
     ids=lambda value: type(value).__name__,
 )
 def test_how_the_best_control_changes(problem, joint, coarse):
-    """Forwards to the left and backwards to the right are vertices, for which five levels suffice; headings are not."""
+    """Forwards to the left and backwards to the right are vertices, for which five levels suffice; headings are not.
+
+    The best speed of a sprint and the best share at risk lie between their bounds. Noise that grows with |u| makes
+    either bound or the middle the best.
+    """
     for seed in range(3):
         found = switching(problem, seed)
         assert (found.joint > JOINT) == joint

@@ -104,3 +104,22 @@ class Toggle(ReachAvoidProblem):
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
         return rows(3.0 - x[..., 0], 3.2 - x[..., 1])
+
+
+class Investor(ReachAvoidProblem):
+    """Reach a sum before ruin; the control is the share of the money that is at risk, up to three times of it."""
+
+    horizon = 4.0
+    states, controls = Box([0.2], [2.0]), Box([0.0], [3.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return x * (0.02 + 0.1 * u)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return (x * (0.02 + 0.25 * u)).unsqueeze(-1)
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return 1.5 - x
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        return x - 0.5
