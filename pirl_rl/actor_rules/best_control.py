@@ -56,7 +56,7 @@ class BestControl(ActorRule):
         budget: the largest number of points times controls; of more points the first are taken, so that an update of
             the actor does not cost more with more controls. Where candidates are simulated, it is the largest number of
             simulated states. Each level of each control at each point then needs `steps` of them for a look ahead, and
-            2w for the cubature with w noise channels.
+            w/2 for the cubature with w noise channels: each of its 2w ends counts as a quarter, since it needs V alone.
         inertia: what a level loses for each unit of its distance from the actor's output when levels are compared, as a
             share of the range of the Hamiltonian, >= 0; see `pirl_rl.ascent.improved`. Where noise grows with |u|, both
             bounds are good beside a convex obstacle, and the worst control lies between them. Without inertia the
@@ -88,7 +88,7 @@ class BestControl(ActorRule):
         self.controlled_noise, self.compiles_whole = has_controlled_noise(problem), steps == 0
         channels, self.budget = noise_channels(problem), budget
         self.cubature = steps == 0 and self.controlled_noise and channels * problem.controls.dim <= 64
-        self.simulated = steps or (2 * channels if self.cubature else 0)
+        self.simulated = steps or (channels / 2 if self.cubature else 0)
         self.flow: Flow = simulator.flow
 
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
@@ -115,7 +115,7 @@ class BestControl(ActorRule):
 
     def most_points(self, groups: int, levels: int) -> int:
         """The largest number of points that the budget allows, for so many groups of coordinates with their levels."""
-        return max(1, self.budget // (groups * max(1, levels * self.simulated)))
+        return max(1, int(self.budget / (groups * max(1, levels * self.simulated))))
 
     def _objective(self, solution: Solution, tau: Tensor, x: Tensor) -> Objective:
         if self.steps:
