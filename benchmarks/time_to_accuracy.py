@@ -128,7 +128,7 @@ def train_apart(name: str, settings: list[str], truth: Truth, every: int, warm: 
     """`train` in a new process, with an empty cache of compiled programs, or one that a short run has filled."""
     with tempfile.TemporaryDirectory() as folder:
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = folder  # the new processes inherit it
-        for more in [[f"trainer.updates={WARM_UP}"]] * warm + [[]]:
+        for more in ([f"trainer.updates={WARM_UP}"], []) if warm else ([],):
             with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
                 run = pool.submit(train, name, [*settings, *more], truth, every, time.monotonic()).result()
     return run

@@ -117,7 +117,10 @@ def _all_suit_choices(config: DictConfig, trust: Sequence[str]) -> bool:
 
 
 def _suits_choices(config: DictConfig, key: str, trust: Sequence[str]) -> bool:
-    """Whether the class of an actor rule says that it trains choices; `Sum` knows that only of the rules it holds."""
+    """Whether an actor rule looks no steps ahead, and its class says that it trains choices.
+
+    `Sum` knows that only of the rules it holds, and counts as one that does not.
+    """
     target = OmegaConf.select(config, f"{key}._target_")
     if target is None or OmegaConf.select(config, f"{key}.steps"):
         return False
