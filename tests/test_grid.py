@@ -14,6 +14,7 @@ from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.grid import GridSolution, GridSolver
 from pirl_rl.problems import CartPole, DoubleIntegrator, DubinsCar, Exit1D, HalfSpace, RadialExit, Reach1D, Safety1D
+from pirl_rl.scoring.truth import DOUBT
 
 
 class Skewed(HalfSpace):
@@ -329,6 +330,46 @@ def test_weak_noise_in_three_dimensions_has_its_closed_form():
         errors.append(error.mean().item())
     assert errors[0] < 0.035
     assert errors[1] < 0.018
+
+
+def test_extrapolation_halves_the_error_of_turns():
+    problem = Calm()
+    tau, x = points(problem, 1_000)
+    solution, exact = GridSolver(problem, points=25, levels=2).solve(), problem.exact_value(tau, x)
+    error, estimate = (solution.value(tau, x) - exact).abs(), solution.error(tau, x)
+    assert (error <= estimate + 0.03).all()
+    solution.coarse = None
+    assert error.mean() < 0.6 * (solution.value(tau, x) - exact).abs().mean()
+
+
+class Track(ReachAvoidProblem):
+    """Run to x_1 >= 1 at speed 1; only lanes with |x_2| <= 0.3 end in A, and nobody leaves a lane, so that V jumps."""
+
+    horizon = 2.0
+    states, controls = Box([-1.0] * 3, [1.0] * 3), Box([-1.0], [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.stack([torch.ones_like(u[..., 0]), torch.zeros_like(u[..., 0]), u[..., 0]], -1)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return x.new_tensor([[0.0], [0.0], [0.1]]).expand(*x.shape, 1)
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return torch.stack([1 - x[..., 0], x[..., 1].abs() - 0.3], -1)
+
+    def exact_value(self, tau: Tensor, x: Tensor) -> Tensor:
+        return ((x[..., 1].abs() <= 0.3) & (x[..., 0] + tau >= 1)).to(x.dtype)
+
+
+def test_the_estimate_sees_jumps_that_both_meshes_smear_alike():
+    problem = Track()
+    tau, x = points(problem, 1_000)
+    solution = GridSolver(problem, points=25, levels=2).solve()
+    assert solution.split
+    wrong = (solution.value(tau, x) - problem.exact_value(tau, x)).abs() > 0.1
+    assert wrong.sum() > 50
+    assert (solution.error(tau, x)[wrong] > DOUBT).all()
+    assert (solution._distance(tau, x)[wrong] <= DOUBT).double().mean() > 0.05, "the distance of both would do"
 
 
 @pytest.mark.parametrize(("problem", "split"), [(DubinsCar(), True), (HalfSpace(dim=3), False), (Calm(2), False)])
