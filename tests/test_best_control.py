@@ -375,6 +375,20 @@ def test_the_rule_raises_the_score_of_the_best_choice():
     assert torch.allclose(last.bias.grad, expected, rtol=1e-4)
 
 
+@pytest.mark.parametrize(("inertia", "index"), [(None, 3), (0.1, 32)])
+def test_an_actor_with_choices_turns_from_pi_to_a_heading_just_above_minus_pi(inertia, index):
+    """The best heading, -2.55, has the index 3 of 33; that of pi, which the actor has, is worse by 8 % of the range."""
+    problem = Heading()
+    tau, x = points(problem, 16)
+    replay = TensorDict({"tau": tau.unsqueeze(-1), "state": x}, batch_size=[16])
+    solution = Solution(problem, Actor(problem, choices=33), stack([Slanted(problem)]))
+    last = solution.actor.layers[-2]
+    torch.nn.init.zeros_(last.weight)
+    last.bias.data = torch.nn.functional.one_hot(torch.tensor(32), 99).float()
+    BestControl(problem, Simulator(problem, 0.1), inertia=inertia)(solution, replay, replay).backward()
+    assert last.bias.grad[:33].argmax() == index
+
+
 @pytest.mark.parametrize(
     ("problem", "levels"),
     [
@@ -467,6 +481,14 @@ class Rising(Critic):
         return state[..., :1].unsqueeze(0)
 
 
+class Slanted(Critic):
+    """V = x_1 cos a + x_2 sin a, for which the best heading is a = -13 pi/16."""
+
+    def forward(self, tau: Tensor, state: Tensor, action: Tensor) -> Tensor:
+        heading = torch.tensor(-13 / 16 * math.pi)
+        return (state * torch.stack([heading.cos(), heading.sin()])).sum(-1, keepdim=True).unsqueeze(0)
+
+
 def test_masked_points_do_not_count():
     problem = Steered()
     solution, (tau, x) = solution_of(problem), points(problem)
@@ -477,10 +499,10 @@ def test_masked_points_do_not_count():
 
 def test_what_the_rule_refuses():
     with pytest.raises(
-        ArgumentError, match=r"steps >= 0, levels >= 2, budget >= 1 and inertia >= 0, got 0, 1, 8192 and 0\.1"
+        ArgumentError, match=r"steps >= 0, levels >= 2, budget >= 1 and inertia >= 0, got 0, 1, 8192 and None"
     ):
         BestControl(Reach1D(), Simulator(Reach1D(), 0.1), levels=1)
-    with pytest.raises(ArgumentError, match=r"budget >= 1 and inertia >= 0, got 0, 2, 0 and 0\.1"):
+    with pytest.raises(ArgumentError, match=r"budget >= 1 and inertia >= 0, got 0, 2, 0 and None"):
         BestControl(Reach1D(), Simulator(Reach1D(), 0.1), budget=0)
     with pytest.raises(ArgumentError, match=r"inertia >= 0, got 0, 2, 8192 and -0\.1"):
         BestControl(Reach1D(), Simulator(Reach1D(), 0.1), inertia=-0.1)

@@ -20,6 +20,16 @@ from pirl_rl.solution import Solution
 from pirl_rl.structure import has_controlled_noise, noise_channels
 from pirl_rl.switching import LEVELS, control_levels
 
+INERTIA = 0.1
+"""The inertia for an actor whose output is a tanh."""
+
+CHOICE_INERTIA = 0.02
+"""The inertia for an actor that chooses among numbers.
+
+It passes through nothing between two of them, and must get from a heading of pi to one just above -pi, or from forwards
+to backwards. Without any, the best of many nearly equal levels changes with each small change of V.
+"""
+
 
 class BestControl(ActorRule):
     """The negative mean of T sum_i w_i CE((1 + a_i)/2, (1 + pi_i)/2) over points, Eq. (best_control).
@@ -61,6 +71,7 @@ class BestControl(ActorRule):
             share of the range of the Hamiltonian, >= 0; see `pirl_rl.ascent.improved`. Where noise grows with |u|, both
             bounds are good beside a convex obstacle, and the worst control lies between them. Without inertia the
             better bound changes with each small change of V, and an actor that follows comes to rest between both.
+            None takes `INERTIA`, or `CHOICE_INERTIA` for an actor that chooses among numbers.
 
     Raises:
         ArgumentError: `steps` or `inertia` is below 0, `levels` below 2, or `budget` below 1.
@@ -75,11 +86,11 @@ class BestControl(ActorRule):
         steps: int = 0,
         levels: int | None = None,
         budget: int = 8_192,
-        inertia: float = 0.1,
+        inertia: float | None = None,
     ):
         if levels is None:
             levels = max(LEVELS if steps else 2, control_levels(problem))
-        if steps < 0 or levels < 2 or budget < 1 or inertia < 0:
+        if steps < 0 or levels < 2 or budget < 1 or (inertia is not None and inertia < 0):
             raise ArgumentError(
                 "actor_rule: expected steps >= 0, levels >= 2, budget >= 1 and inertia >= 0, "
                 f"got {steps}, {levels}, {budget} and {inertia}"
@@ -101,7 +112,8 @@ class BestControl(ActorRule):
         with torch.no_grad():
             action = actor.layers[-1](logits)
             objective = self._objective(solution, tau.squeeze(-1), x)
-            best, weight = improved(objective, action, levels, self.inertia)
+            usual = CHOICE_INERTIA if choice else INERTIA
+            best, weight = improved(objective, action, levels, usual if self.inertia is None else self.inertia)
         if choice:
             scores = choice.grouped(logits).movedim(-1, 1)
             entropy = torch.nn.functional.cross_entropy(scores, choice.indices(best), reduction="none")
