@@ -46,10 +46,35 @@ def is_control_affine(problem: ReachAvoidProblem, points: int = 256, seed: int =
     rng = torch.Generator().manual_seed(seed)
     x = problem.states.sample(points, rng, torch.float64)
     one, other = (problem.controls.sample(points, rng, torch.float64) for _ in range(2))
-    share = torch.rand(points, 1, generator=rng, dtype=torch.float64)
+    return _is_affine_between(problem, x, one, other, rng) and not has_controlled_noise(problem, points, seed)
+
+
+def is_affine_in(problem: ReachAvoidProblem, axis: int, points: int = 256, seed: int = 0) -> bool:
+    """Whether the drift is affine in one coordinate of u while the others stand still, and sigma does not depend on it.
+
+    The Hamiltonian has its maximum over this coordinate at one of its bounds then, whatever the others are.
+
+    Args:
+        problem: the physics.
+        axis: the coordinate, counted from 0.
+        points: the number of states, each with two controls and a random point on the line through them.
+        seed: of the points.
+    """
+    rng = torch.Generator().manual_seed(seed)
+    x = problem.states.sample(points, rng, torch.float64)
+    one, drawn = (problem.controls.sample(points, rng, torch.float64) for _ in range(2))
+    other = one.clone()
+    other[:, axis] = drawn[:, axis]
+    still = torch.equal(problem.diffusion(x, one), problem.diffusion(x, other))
+    return still and _is_affine_between(problem, x, one, other, rng)
+
+
+def _is_affine_between(problem: ReachAvoidProblem, x: Tensor, one: Tensor, other: Tensor, rng: torch.Generator) -> bool:
+    """Whether the drift at states x (N, n) is affine on the lines through two controls, (N, m) each."""
+    share = torch.rand(len(x), 1, generator=rng, dtype=x.dtype)
     expected = (1 - share) * problem.drift(x, one) + share * problem.drift(x, other)
     gap = (problem.drift(x, (1 - share) * one + share * other) - expected).abs()
-    return bool((gap <= ROUNDING * expected.abs().amax(0)).all()) and not has_controlled_noise(problem, points, seed)
+    return bool((gap <= ROUNDING * expected.abs().amax(0)).all())
 
 
 def check_problem(problem: ReachAvoidProblem, points: int = 100_000, seed: int = 0) -> None:

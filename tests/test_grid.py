@@ -8,13 +8,25 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.kinds import Crosswind
+from benchmarks.kinds import Bicycle, Crosswind, Gusty, Loiter
 from pirl_rl import Box, ReachAvoidProblem
 from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.grid import GridSolution, GridSolver
-from pirl_rl.problems import CartPole, DoubleIntegrator, DubinsCar, Exit1D, HalfSpace, RadialExit, Reach1D, Safety1D
+from pirl_rl.grid.candidates import candidates
+from pirl_rl.problems import (
+    CartPole,
+    DoubleIntegrator,
+    DubinsCar,
+    Exit1D,
+    HalfSpace,
+    RadialExit,
+    Reach1D,
+    Safety1D,
+    VehicleDrift3,
+)
 from pirl_rl.scoring.truth import DOUBT
+from pirl_rl.structure import is_affine_in
 
 
 class Skewed(HalfSpace):
@@ -275,6 +287,19 @@ def test_a_control_inside_the_box_may_be_the_best():
     torch.testing.assert_close(solution.value(tau, x), problem.exact_value(tau, x), rtol=0, atol=2e-3)
     assert (solution.policy(tau, x) - 0.3).abs().max() < 0.05
     assert (problem.exact_value(tau, x) - few.value(tau, x)).max() > 0.05
+
+
+@pytest.mark.parametrize(
+    ("problem", "numbers"),
+    [(Loiter(), [3, 33]), (Gusty(), [11, 11]), (DubinsCar(), [3]), (VehicleDrift3(), [5, 5]), (Bicycle(), [3, 9])],
+)
+def test_only_controls_whose_best_value_may_lie_between_their_bounds_have_many_levels(problem, numbers):
+    """The drift is affine in the speed of Loiter and of Bicycle while the heading or the wheel stands still."""
+    assert [is_affine_in(problem, axis) for axis in range(len(numbers))] == [number == 3 for number in numbers]
+    x = problem.states.sample(1, torch.Generator().manual_seed(0), torch.float64).numpy()
+    chosen = candidates(problem, x, problem.states.sample(1, dtype=torch.float64).numpy())[:, 0]
+    assert [len(set(column)) for column in chosen.T] == numbers
+    assert len(chosen) == math.prod(numbers)
 
 
 @pytest.mark.parametrize(

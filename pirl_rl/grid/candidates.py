@@ -2,7 +2,8 @@
 
 They are the tensor product of equidistant levels along the axes of the box of controls. For a drift that is affine in u
 and a sigma without u the best control is a vertex of the box, and three levels are enough. Otherwise it may lie
-anywhere in the box, and there are as many levels as `MOST` candidates allow.
+anywhere in the box, and there are as many levels as `MOST` candidates allow; a coordinate in which the drift is affine
+while the others stand still, as the speed beside the heading, still has three.
 
 With more controls the tensor product is too large. Then there is one candidate for each direction p in which grad V
 may point: the control with the largest p . f(x, u), found axis by axis, which is exact for an affine drift and a sigma
@@ -11,6 +12,8 @@ without u. Their number depends on n and their cost is linear in m.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
@@ -18,7 +21,7 @@ import torch
 from torch import Tensor
 
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.structure import is_control_affine
+from pirl_rl.structure import is_affine_in, is_control_affine
 
 FEW = 32
 """The largest number of candidates in a tensor product where vertices are enough: three controls have 27."""
@@ -26,8 +29,8 @@ FEW = 32
 MOST = {1: 128, 2: 128, 3: 32}
 """The largest number of candidates in a tensor product where they are not, by the number of states."""
 
-LEVELS = 33
-"""The largest number of levels that is chosen for a control."""
+VERTEX_LEVELS, LEVELS = 3, 33
+"""The number of levels of a control whose best value is a bound, and the largest number that is chosen otherwise."""
 
 SWEEPS = 2
 """Number of times that every axis of the control is improved with the others held."""
@@ -42,29 +45,37 @@ def candidates(problem: ReachAvoidProblem, x: np.ndarray, spacing: np.ndarray, l
         spacing: the distances of nodes along each axis.
         levels: the number of levels of each control; by default it follows from the problem.
     """
-    controls, m, affine = problem.controls, problem.controls.dim, is_control_affine(problem)
-    most = FEW if affine else MOST[problem.states.dim]
-    if levels is None:
-        # An odd number has the middle of the box among the levels.
-        levels = next((k for k in range(LEVELS, 3, -2) if not affine and k**m <= most), 3)
-    marks = np.linspace(-1.0, 1.0, levels)
-    if levels**m <= most:
-        chosen = controls.denormalize(torch.tensor(list(product(marks, repeat=m)), dtype=torch.float64)).numpy()
+    controls, m = problem.controls, problem.controls.dim
+    most = FEW if is_control_affine(problem) else MOST[problem.states.dim]
+    numbers = _numbers_of_levels(problem, most) if levels is None else [levels] * m
+    axes = [np.linspace(-1.0, 1.0, number) for number in numbers]
+    if math.prod(numbers) <= most:
+        chosen = controls.denormalize(torch.tensor(list(product(*axes)), dtype=torch.float64)).numpy()
         return np.broadcast_to(chosen[:, None], (len(chosen), len(x), m))
     points = torch.from_numpy(x)
     steepest = [
-        _steepest(problem, points, torch.tensor(direction / spacing), marks)
+        _steepest(problem, points, torch.tensor(direction / spacing), axes)
         for direction in product((-1, 0, 1), repeat=x.shape[1])
     ]
     return controls.denormalize(torch.stack(steepest)).numpy()
 
 
-def _steepest(problem: ReachAvoidProblem, x: Tensor, direction: Tensor, marks: np.ndarray) -> Tensor:
+def _numbers_of_levels(problem: ReachAvoidProblem, most: int) -> list[int]:
+    """The number of levels of each coordinate of the control, whose product is at most `most` where that can be."""
+    at_bounds = [is_affine_in(problem, axis) for axis in range(problem.controls.dim)]
+    others = at_bounds.count(False)
+    few = VERTEX_LEVELS ** at_bounds.count(True)
+    # An odd number has the middle of the box among the levels.
+    many = next((k for k in range(LEVELS, 3, -2) if few * k**others <= most), VERTEX_LEVELS)
+    return [VERTEX_LEVELS if bound else many for bound in at_bounds]
+
+
+def _steepest(problem: ReachAvoidProblem, x: Tensor, direction: Tensor, axes: Sequence[np.ndarray]) -> Tensor:
     """The normalised control (M, m) with the largest direction . f(x, u), axis by axis from the middle of the box."""
     action = x.new_zeros(len(x), problem.controls.dim)
     best = problem.drift(x, problem.controls.denormalize(action)) @ direction
     for axis in list(range(action.shape[1])) * SWEEPS:
-        for mark in marks:
+        for mark in axes[axis]:
             trial = action.clone()
             trial[:, axis] = mark
             speed = problem.drift(x, problem.controls.denormalize(trial)) @ direction
