@@ -24,10 +24,11 @@ INERTIA = 0.1
 """The inertia for an actor whose output is a tanh."""
 
 CHOICE_INERTIA = 0.02
-"""The inertia for an actor that chooses among numbers.
+"""The inertia for an actor that chooses among numbers, where the noise does not depend on the control.
 
-It passes through nothing between two of them, and must get from a heading of pi to one just above -pi, or from forwards
-to backwards. Without any, the best of many nearly equal levels changes with each small change of V.
+Such an actor passes through nothing between two numbers, and must get from a heading of pi to one just above -pi, or
+from forwards to backwards. Where sigma depends on u, levels are compared by second differences of V, which are less
+exact, and the best of many nearly equal levels would change with each small change of V.
 """
 
 
@@ -71,7 +72,7 @@ class BestControl(ActorRule):
             share of the range of the Hamiltonian, >= 0; see `pirl_rl.ascent.improved`. Where noise grows with |u|, both
             bounds are good beside a convex obstacle, and the worst control lies between them. Without inertia the
             better bound changes with each small change of V, and an actor that follows comes to rest between both.
-            None takes `INERTIA`, or `CHOICE_INERTIA` for an actor that chooses among numbers.
+            None takes `INERTIA`, or `CHOICE_INERTIA` for an actor that chooses among numbers and a sigma without u.
 
     Raises:
         ArgumentError: `steps` or `inertia` is below 0, `levels` below 2, or `budget` below 1.
@@ -112,7 +113,7 @@ class BestControl(ActorRule):
         with torch.no_grad():
             action = actor.layers[-1](logits)
             objective = self._objective(solution, tau.squeeze(-1), x)
-            usual = CHOICE_INERTIA if choice else INERTIA
+            usual = CHOICE_INERTIA if choice and not self.controlled_noise else INERTIA
             best, weight = improved(objective, action, levels, usual if self.inertia is None else self.inertia)
         if choice:
             scores = choice.grouped(logits).movedim(-1, 1)

@@ -51,10 +51,9 @@ class GridSolver:
         problem: the physics, with at most three states.
         points: number of nodes across `problem.states` along each axis, at least 5; one number serves all axes. A part
             of A or B that is thinner than the distance of two nodes may be missed.
-        steps: number of steps in tau, at least 2; the default is the largest number of points. With three states and
-            noise that is weak beside the mesh it is larger, up to `MOST_STEPS` times, where most paths would lead
-            through more than two cells in a step: drift and noise can act in turns only with shorter steps, see
-            `pirl_rl.grid.transport`.
+        steps: number of steps in tau, at least 2; the default is the largest number of points. With noise that is weak
+            beside the mesh it is larger, up to `MOST_STEPS` times, where most paths would lead through more than two
+            cells in a step: drift and noise can act in turns only with shorter steps, see `pirl_rl.grid.transport`.
         margin: how far the mesh goes beyond `problem.states` on each side, in SI units, one number for each axis. The
             default follows from drift, noise and horizon, see `pirl_rl.grid.mesh.default_margin`.
         levels: number of levels of each control among the candidates, at least 2; the default follows from the
@@ -142,8 +141,7 @@ class GridSolver:
     def _scheme(self, mesh: Mesh, x: np.ndarray, controls: np.ndarray) -> tuple[int, bool]:
         """The number of steps, and whether drift and noise act in turns, at nodes x (M, n) with controls (K, M, m)."""
         steps = max(self.points) if self.steps is None else self.steps
-        # Two states have meshes that are fine enough for the chain, which is monotone.
-        if len(self.points) < 3 or not is_weak(self.problem, mesh, x, controls):
+        if not is_weak(self.problem, mesh, x, controls):
             return steps, False
         needed = math.ceil(self.problem.horizon / longest_step(self.problem, mesh, x, controls))
         most = MOST_STEPS * steps if self.steps is None else steps
