@@ -357,6 +357,16 @@ def test_weak_noise_in_three_dimensions_has_its_closed_form():
     assert errors[1] < 0.018
 
 
+@pytest.mark.parametrize(("dim", "count", "tolerance"), [(1, 101, 0.006), (2, 41, 0.004)])
+def test_weak_noise_in_fewer_dimensions_has_its_closed_form(dim, count, tolerance):
+    """Where drift and noise act together the errors are 0.011 and 0.031."""
+    problem = Calm(dim)
+    tau, x = points(problem, 1_000)
+    solution = GridSolver(problem, points=count).solve()
+    assert solution.split
+    assert (solution.value(tau, x) - problem.exact_value(tau, x)).abs().mean() < tolerance
+
+
 def test_extrapolation_halves_the_error_of_turns():
     problem = Calm()
     tau, x = points(problem, 1_000)

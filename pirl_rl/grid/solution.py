@@ -23,7 +23,6 @@ ROUNDING = 1e-4
 SMALLEST = 1e-6
 """The smallest V, and 1 - V, whose log-odds are extrapolated. V itself is known to 1e-7 in each step."""
 
-
 SHARE = 0.5
 """The share of the distance of both solutions by which V is extrapolated where drift and noise act in turns.
 
