@@ -3,11 +3,11 @@
     python benchmarks/own_problems.py [NAME ...] [--seed 50] [--settings KEY=VALUE ...] [--out FOLDER] [--json FILE]
 
 Some of them took part in choices, with other seeds and states: Gusty and Slalom in those of the logarithms of the
-levels, the networks and the rules of where episodes start, Gusty in those of the inertia of `BestControl` and the
-choices of the actor, and TwoHarbours, Bicycle and Sprint in the rules of `pirl_rl.switching`; the others in none. V and
-the success of the learned policy are compared with the grid, in the way of the suite, at 400 states with 1,000 paths
-from each. With three states and two controls there is no truth. A run takes minutes; a finished one is loaded, so that
-other settings need another folder.
+levels, the networks and the rules of where episodes start, Gusty, Investor, Loiter, Bicycle, TwoHarbours and Sprint in
+those of the inertia of `BestControl`, Gusty and Investor in that of its budget, and TwoHarbours, Bicycle, Sprint and
+Investor in the rules of `pirl_rl.switching`; the others in none. V and the success of the learned policy are compared
+with the grid, in the way of the suite, at 400 states with 1,000 paths from each. With three states and two controls
+there is no truth. A run takes minutes; a finished one is loaded, so that other settings need another folder.
 """
 
 from __future__ import annotations
