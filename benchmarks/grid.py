@@ -57,14 +57,14 @@ def closed_forms() -> list[dict[str, Any]]:
     return rows
 
 
-def dubins(points: int, rollouts: int = 2_000) -> None:
+def dubins(points: int, seed: int, rollouts: int = 2_000) -> None:
     """Print V against Monte Carlo of the grid's own policy at 50 states.
 
     V is that of a control that is never held, so that Monte Carlo holds it for a two-thousandth of the horizon.
     """
     problem, started = DubinsCar(), time.perf_counter()
     solution = GridSolver(problem, points).solve()
-    seconds, (tau, x) = time.perf_counter() - started, states(DubinsCar(), 50)
+    seconds, (tau, x) = time.perf_counter() - started, states(problem, 50, seed)
     played = monte_carlo(problem, solution.policy, tau, x, rollouts=rollouts, dt=problem.horizon / 2_000)
     value = solution.value(tau, x)
     distance = (value - played.probability).abs()
@@ -99,12 +99,12 @@ if __name__ == "__main__":
         "--steps", type=int, help="steps in time to go, with --run; by default they follow from the problem"
     )
     parser.add_argument("--run", help="compare the policy of this run directory with the grid's")
-    parser.add_argument("--seed", type=int, default=0, help="of the states, with --run")
+    parser.add_argument("--seed", type=int, default=0, help="of the states, with --run and --dubins")
     parser.add_argument("--json", type=Path, help="write what is found in one and two dimensions to this file")
     arguments = parser.parse_args()
     if arguments.run:
         against(arguments.run, arguments.points, arguments.steps, arguments.seed)
     elif arguments.dubins:
-        dubins(arguments.points)
+        dubins(arguments.points, arguments.seed)
     else:
         save(arguments.json, {}, rows=closed_forms())

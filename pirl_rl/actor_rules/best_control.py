@@ -21,7 +21,7 @@ from pirl_rl.structure import has_controlled_noise, noise_channels
 from pirl_rl.switching import LEVELS, control_levels
 
 INERTIA = 0.1
-"""The inertia for an actor whose output is a tanh."""
+"""The inertia for an actor whose output is a tanh, and for all actors where the noise depends on the control."""
 
 CHOICE_INERTIA = 0.02
 """The inertia for an actor that chooses among numbers, where the noise does not depend on the control.
@@ -72,7 +72,8 @@ class BestControl(ActorRule):
             share of the range of the Hamiltonian, >= 0; see `pirl_rl.ascent.improved`. Where noise grows with |u|, both
             bounds are good beside a convex obstacle, and the worst control lies between them. Without inertia the
             better bound changes with each small change of V, and an actor that follows comes to rest between both.
-            None takes `INERTIA`, or `CHOICE_INERTIA` for an actor that chooses among numbers and a sigma without u.
+            None takes `CHOICE_INERTIA` for an actor that chooses among numbers, if sigma does not depend on u, and
+            else `INERTIA`.
 
     Raises:
         ArgumentError: `steps` or `inertia` is below 0, `levels` below 2, or `budget` below 1.
