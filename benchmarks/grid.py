@@ -23,6 +23,7 @@ from pirl_rl import load_run
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.grid import GridSolver
 from pirl_rl.problems import DubinsCar, Exit1D, HalfSpace, RadialExit, Reach1D
+from pirl_rl.scoring.truth import DOUBT
 
 MESHES = ((Reach1D(), (101, 201, 401)), (Exit1D(), (101, 201, 401)))
 MESHES += ((HalfSpace(dim=2), (41, 81, 121)), (RadialExit(dim=2), (41, 81, 121)))
@@ -73,8 +74,11 @@ def dubins(points: int, seed: int, rollouts: int = 2_000) -> None:
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"DubinsCar, {points} points, {seconds:.0f} s, {memory:.1f} GiB")
     print(f"mean |V - MC| {distance.mean():.4f}, largest {distance.max():.4f}")
-    print(f"mean estimate of the error of V {solution.error(tau, x).mean():.4f}")
-    print(f"share of the states within three standard errors {(distance <= 3 * noise).double().mean():.2f}")
+    estimate, within = solution.error(tau, x), (distance <= 3 * noise).double()
+    trusted = estimate <= DOUBT
+    print(f"mean estimate of the error of V {estimate.mean():.4f}")
+    print(f"share of the states within three standard errors {within.mean():.2f}")
+    print(f"of the {trusted.sum()} states with an estimate of at most {DOUBT} {within[trusted].mean():.2f}")
 
 
 def against(run_dir: str, points: int, steps: int | None, seed: int, rollouts: int = 400, count: int = 400) -> None:
