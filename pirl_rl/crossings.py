@@ -71,6 +71,18 @@ def passage_probability(constraints: Constraints, x: Tensor, moved: Tensor, sigm
     return first_passage(torch.ones_like(level), level, level - after, deviation)
 
 
+def crossing_probability(constraints: Constraints, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor) -> Tensor:
+    """The probability (N, k) that bridges are inside of each of k faces at some time, 1 where one of the ends is.
+
+    Args:
+        constraints: the levels of the faces.
+        x, moved: both ends of the bridges (N, n).
+        sigma: (N, n, w) at x.
+        h: the time between the ends (N,), in s.
+    """
+    return _chance(*_bridge(constraints, x, moved, sigma, h))
+
+
 def crosses_any(
     constraints: Constraints, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor, uniform: Tensor
 ) -> Tensor:
@@ -153,7 +165,7 @@ def _crossing_time(before: Tensor, after: Tensor, variance: Tensor, uniform: Ten
 def _bridge(constraints: Constraints, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor) -> tuple[Tensor, ...]:
     """The levels (N, k) at both ends, and the variance (N, k) of the levels over the time h (N,)."""
     before, after = constraints(x), constraints(moved)
-    return before, after, _squared_noise(constraints, x, sigma, before.shape[-1]) * h[..., None]
+    return before, after, squared_noise(constraints, x, sigma, before.shape[-1]) * h[..., None]
 
 
 def _probability(before: Tensor, after: Tensor, variance: Tensor) -> Tensor:
@@ -163,8 +175,15 @@ def _probability(before: Tensor, after: Tensor, variance: Tensor) -> Tensor:
     return torch.where(between, (-2 * before * after / variance).exp(), torch.zeros_like(before))
 
 
-def _squared_noise(constraints: Constraints, x: Tensor, sigma: Tensor, count: int) -> Tensor:
-    """|sigma^T grad g|^2 (N, k) of `count` constraints g at x (N, n), by the fewer of w and k derivatives."""
+def squared_noise(constraints: Constraints, x: Tensor, sigma: Tensor, count: int) -> Tensor:
+    """|sigma^T grad g|^2 (N, k) of k = `count` constraints g at x (N, n), by the fewer of w and k derivatives.
+
+    Args:
+        constraints: the levels g of the faces.
+        x: states (N, n).
+        sigma: (N, n, w) at x.
+        count: the number k.
+    """
     if sigma.shape[-1] <= count:
         along = [torch.func.jvp(constraints, (x,), (column,))[1] for column in sigma.unbind(-1)]
         return torch.stack([rate**2 for rate in along]).sum(0)

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pirl_rl.crossings import _crossing_time, crosses_any, enters_intersection, first_passage, passage_probability
+from pirl_rl.crossings import _crossing_time, crosses_any, crossing_probability, enters_intersection, first_passage
 
 DEVIATION = 0.7
 PATHS = 200_000
@@ -153,12 +153,14 @@ def test_first_passage_is_a_probability_at_extreme_arguments(dtype):
     assert torch.equal(p[tau == 0], (d[tau == 0] <= 0).to(dtype))
 
 
-def test_a_path_leaves_a_wall_with_its_exact_probability():
-    """With drift v away from a face at the distance a, 1 - exp(-2 a v / sigma^2) of the paths never cross it."""
-    a, v, s, h = torch.tensor([0.01, 0.1, 0.3], dtype=torch.float64), 1.0, 0.5, 50.0
-    x, moved = a[:, None], a[:, None] + v * h
-    sigma, time = torch.full((3, 1, 1), s, dtype=torch.float64), torch.full((3,), h, dtype=torch.float64)
-    crossed = passage_probability(lambda y: y, x, moved, sigma, time)
-    torch.testing.assert_close(crossed[:, 0], (-2 * a * v / s**2).exp(), rtol=0, atol=1e-6)
-    still = passage_probability(lambda y: y, x, x, sigma * 0, time)
-    assert (still == 0).all()
+def test_bridges_with_random_ends_cross_with_the_probability_of_a_first_passage():
+    """The mean over the normal distribution of the ends is taken at 20,001 equidistant quantiles."""
+    a, v, s, h = 0.3, 0.4, 0.5, 2.0
+    quantiles = (torch.arange(20_001, dtype=torch.float64) + 0.5) / 20_001
+    moved = a + v * h + s * h**0.5 * torch.special.ndtri(quantiles)[:, None]
+    sigma, time = torch.full((20_001, 1, 1), s, dtype=torch.float64), torch.full((20_001,), h, dtype=torch.float64)
+    crossed = crossing_probability(lambda y: y, torch.full_like(moved, a), moved, sigma, time)
+    passage = first_passage(*torch.tensor([h, a, -v, s], dtype=torch.float64))
+    torch.testing.assert_close(crossed.mean(), passage, rtol=0, atol=1e-4)
+    without_noise = crossing_probability(lambda y: y, moved.abs() + 1, moved.abs() + 2, sigma * 0, time)
+    assert (without_noise == 0).all()

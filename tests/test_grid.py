@@ -354,13 +354,13 @@ def test_weak_noise_in_three_dimensions_has_its_closed_form():
         assert solution.split
         error = (solution.value(tau, x) - problem.exact_value(tau, x)).abs()
         errors.append(error.mean().item())
-    assert errors[0] < 0.035
-    assert errors[1] < 0.018
+    assert errors[0] < 0.018
+    assert errors[1] < 0.010
 
 
-@pytest.mark.parametrize(("dim", "count", "tolerance"), [(1, 101, 0.006), (2, 41, 0.004)])
+@pytest.mark.parametrize(("dim", "count", "tolerance"), [(1, 101, 0.0008), (2, 41, 0.0020)])
 def test_weak_noise_in_fewer_dimensions_has_its_closed_form(dim, count, tolerance):
-    """Where drift and noise act together the errors are 0.011 and 0.031."""
+    """Drift and noise together have errors of 0.011 and 0.031, and 0.0036 and 0.0014 with plain first steps."""
     problem = Calm(dim)
     tau, x = points(problem, 1_000)
     solution = GridSolver(problem, points=count).solve()
@@ -368,14 +368,14 @@ def test_weak_noise_in_fewer_dimensions_has_its_closed_form(dim, count, toleranc
     assert (solution.value(tau, x) - problem.exact_value(tau, x)).abs().mean() < tolerance
 
 
-def test_extrapolation_halves_the_error_of_turns():
+def test_extrapolation_lowers_the_error_of_turns():
     problem = Calm()
     tau, x = points(problem, 1_000)
     solution, exact = GridSolver(problem, points=25, levels=2).solve(), problem.exact_value(tau, x)
     error, estimate = (solution.value(tau, x) - exact).abs(), solution.error(tau, x)
     assert (error <= estimate + 0.03).all()
     solution.coarse = None
-    assert error.mean() < 0.6 * (solution.value(tau, x) - exact).abs().mean()
+    assert error.mean() < 0.7 * (solution.value(tau, x) - exact).abs().mean()
 
 
 class Track(ReachAvoidProblem):
@@ -437,6 +437,21 @@ def test_v_rises_from_a_wall_that_paths_leave(dubins):
     assert (value - played.probability).abs().max() < 0.1
     layer = 1 - (-2 * problem.speed * distance / problem.noise[0] ** 2).exp()
     assert (value / value[-1] - layer)[:2].abs().max() < 0.01
+
+
+def test_noise_saves_paths_that_the_flow_leads_into_a_wall(dubins):
+    """A car that meets a wall at a small angle may be pushed off it: without noise V would be 0.
+
+    With 1,000 paths from each of 20 states a perfect V would have a mean error of about 0.01.
+    """
+    problem, solution = dubins.problem, dubins
+    distance = torch.linspace(0.02, 0.08, 20, dtype=torch.float64)
+    angle = torch.linspace(0.25, 0.6, 20, dtype=torch.float64)  # rad, between the heading and the wall x_1 = 2
+    x = torch.stack([problem.wall - distance, torch.full_like(angle, -1.2), math.pi / 2 - angle], -1)
+    tau = torch.full((20,), 2.5, dtype=torch.float64)
+    value = solution.value(tau, x)
+    played = monte_carlo(problem, solution.policy, tau, x, rollouts=1_000, dt=0.005).probability
+    assert (value - played).abs().mean() < 0.03
 
 
 def test_noise_two_integrators_away_agrees_with_monte_carlo_of_its_own_policy():

@@ -1,7 +1,9 @@
-"""V in cells that a face of A or B cuts, where the noise is weak beside the mesh.
+"""V near the faces of A and B, where the noise is weak beside the mesh.
 
-There V rises from the face within a layer that is thinner than a cell, so that interpolation between the nodes is
-wrong. A path along the flow, without noise, leads out of these cells; the noise decides whether it crosses the face.
+There V rises from a face within a layer that is thinner than a cell, so that interpolation between the nodes is wrong.
+By dynamic programming V is the mean of V over paths at the time at which they leave the cells near faces, where paths
+that have crossed a face count with its value (Kushner and Dupuis, Numerical Methods for Stochastic Control Problems in
+Continuous Time, 2001).
 """
 
 from __future__ import annotations
@@ -11,71 +13,95 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from pirl_rl.crossings import passage_probability
+from pirl_rl.crossings import crossing_probability
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.sigma import times
 
-STEPS_OF_A_CELL = 8
-"""The number of steps in which a path is followed through a cell."""
+PATHS = 512
+"""The number of paths from each state."""
 
-MOST_CELLS = 8
-"""The largest number of cells through which a path is followed."""
+STEPS = 32
+"""The largest number of steps of a path, at the end of which V between the nodes must do."""
+
+LENGTH = 1.0
+"""The largest part of a cell by which the drift moves a path in a step, and the largest deviation of its noise."""
+
+STATES = 2_000
+"""The number of states whose paths are held in memory together."""
+
+Field = Callable[[Tensor, Tensor], Tensor]
+"""A function of tau (P,) and x (P, n), such as V or a policy."""
 
 
-def beyond_the_face(
+def mean_beyond_faces(
     problem: ReachAvoidProblem,
     spacing: Tensor,
-    policy: Callable[[Tensor, Tensor], Tensor],
-    value: Callable[[Tensor, Tensor], Tensor],
-    cut: Callable[[Tensor], Tensor],
+    policy: Field,
+    value: Field,
+    near: Callable[[Tensor], Tensor],
     tau: Tensor,
     x: Tensor,
 ) -> Tensor:
-    """V (P,) at states outside A and B in cells that a face cuts, from that where the flow has left these cells.
+    """V (P,) at states near faces, outside A and B: its mean over paths at the time at which they leave these cells.
 
-    A path is followed cell by cell, through at most `MOST_CELLS` of them. On the way the noise may cross a face. In
-    each cell its level is taken as Brownian motion with the drift of the way through the cell, see
-    `pirl_rl.crossings.passage_probability`. Paths that cross a face of A and one of B count as failures.
+    All states have the same normal numbers, those of a scrambled Sobol sequence, so that V is the same in every call
+    and nearly continuous in x. Whether a path crosses a face between the ends of a step is not drawn. The path goes on
+    with the probability that it has not, see `pirl_rl.crossings.crossing_probability`. Paths that cross a face of A and
+    one of B in the same step count as failures.
 
     Args:
         problem: the physics.
         spacing: the distances (n,) of the nodes, in SI units.
-        policy: gives the controls, in SI units, at tau and x.
-        value: gives V between the nodes, continued into A and B, at tau and x.
-        cut: says which states x lie in a cell that a face cuts.
+        policy: gives the controls (P, m), in SI units.
+        value: gives V (P,) between the nodes, continued into A and B.
+        near: says which of the states (P, n) lie in a cell near a face.
         tau: times to go (P,), in s.
         x: states (P, n), in SI units.
     """
-    x, left = x.clone(), tau.to(x, copy=True)
-    under_way, result = torch.ones_like(left), torch.zeros_like(left)
-    going = torch.arange(len(x), device=x.device)
-    for _ in range(MOST_CELLS):
-        moved, after, reached, failed = _through_a_cell(problem, spacing, policy, left[going], x[going])
-        x[going], left[going] = moved, after
-        result[going] += under_way[going] * reached
-        under_way[going] *= (1 - reached - failed).clamp(min=0)
-        going = going[cut(moved) & problem.interior(moved) & (after > 0)]
+    noises = problem.diffusion(x[:1], policy(tau[:1], x[:1])).shape[-1]
+    uniform = torch.quasirandom.SobolEngine(STEPS * noises, scramble=True, seed=0).draw(PATHS, dtype=torch.float64)
+    normal = torch.special.ndtri(uniform.clamp(1e-9, 1 - 1e-9)).reshape(PATHS, STEPS, noises).to(x)
+    means = [
+        _mean(problem, spacing, policy, value, near, normal, *part)
+        for part in zip(tau.to(x).split(STATES), x.split(STATES), strict=True)
+    ]
+    return torch.cat(means)
+
+
+def _mean(problem, spacing, policy: Field, value: Field, near, normal: Tensor, tau: Tensor, x: Tensor) -> Tensor:
+    """`mean_beyond_faces` of a few states, with the normal numbers (paths, steps, w) of the noise."""
+    paths = len(normal)
+    left, at = tau.repeat_interleave(paths), x.repeat_interleave(paths, 0)
+    alive, result = torch.ones_like(left), torch.zeros_like(left)
+    going = torch.arange(len(left), device=x.device)
+    for step in range(normal.shape[1]):
+        moved, h, reached, failed = _step(problem, spacing, policy, left[going], at[going], normal[going % paths, step])
+        at[going], left[going] = moved, left[going] - h
+        result[going] += alive[going] * reached
+        alive[going] *= (1 - reached - failed).clamp(min=0)
+        going = going[near(moved) & (alive[going] > 0) & (left[going] > 0)]
         if not len(going):
             break
-    return result + under_way * value(left, x)
+    under_way = alive > 0
+    result[under_way] += alive[under_way] * value(left[under_way], at[under_way])
+    return result.reshape(len(x), paths).mean(-1)
 
 
-def _through_a_cell(
-    problem: ReachAvoidProblem, spacing: Tensor, policy: Callable[[Tensor, Tensor], Tensor], tau: Tensor, x: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Where the flow from x (P, n) is one cell further, the time to go there, and the probabilities, each (P,), that
-    the noise has crossed into A or B on the way."""
+def _step(problem: ReachAvoidProblem, spacing: Tensor, policy: Field, tau: Tensor, x: Tensor, normal: Tensor):
+    """Where paths from x (P, n) are after a step with the noise (P, w), its length (P,) in s, and the probabilities,
+    each (P,), that they have crossed into A or B on the way."""
     u = policy(tau, x)
-    rate = problem.drift(x, u).abs() / spacing
-    length = torch.minimum(tau, 1 / rate.amax(-1).clamp(min=1e-12))
-    moved, left, h = x, tau, length / STEPS_OF_A_CELL
-    for _ in range(STEPS_OF_A_CELL):
-        moved = problem.states.wrap(moved + problem.drift(moved, policy(left, moved)) * h.unsqueeze(-1))
-        left = (left - h).clamp(min=0)
-    sigma, reached, failed = problem.diffusion(x, u), torch.zeros_like(tau), torch.zeros_like(tau)
+    drift, sigma = problem.drift(x, u), problem.diffusion(x, u)
+    variance = (sigma / spacing.unsqueeze(-1)).square().sum(-1)
+    rate = torch.maximum((drift / spacing).abs() / LENGTH, variance / LENGTH**2).amax(-1)
+    h = torch.minimum(tau, 1 / rate.clamp(min=1e-12))
+    half = x + drift * (h / 2).unsqueeze(-1)
+    moved = x + problem.drift(half, u) * h.unsqueeze(-1) + times(sigma, normal) * h.sqrt().unsqueeze(-1)
+    moved, reached, failed = problem.states.wrap(moved), torch.zeros_like(h), torch.zeros_like(h)
     if problem.has_avoid_set:
         # One constraint of B suffices, and all of A must hold.
-        failed = 1 - (1 - passage_probability(problem.avoid_constraints, x, moved, sigma, length)).prod(-1)
+        failed = 1 - (1 - crossing_probability(problem.avoid_constraints, x, moved, sigma, h)).prod(-1)
     if problem.objective == "reach-avoid":
-        crossed = passage_probability(problem.reached_constraints, x, moved, sigma, length).amin(-1)
+        crossed = crossing_probability(problem.reached_constraints, x, moved, sigma, h).amin(-1)
         reached = (1 - failed) * crossed
-    return moved, left, reached, failed
+    return moved, h, reached, failed

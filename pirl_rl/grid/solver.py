@@ -21,7 +21,7 @@ from pirl_rl.grid.candidates import candidates
 from pirl_rl.grid.chain import Chain
 from pirl_rl.grid.mesh import Mesh, absorbed, default_margin, make_mesh
 from pirl_rl.grid.solution import GridSolution
-from pirl_rl.grid.transport import Transport, is_weak, longest_step
+from pirl_rl.grid.transport import FARTHEST, Transport, is_weak, speed_limit
 from pirl_rl.problem import ReachAvoidProblem
 
 POINTS = {1: 401, 2: 121, 3: 51}
@@ -29,6 +29,9 @@ POINTS = {1: 401, 2: 121, 3: 51}
 
 MOST_STEPS = 6
 """The largest number of steps for each of the largest number of points, where it is chosen."""
+
+FIRST = 2.0
+"""The number of cells through which a control is held from tau = 0, where drift and noise act in turns."""
 
 TOLERANCE = 1e-7
 """The largest error of the equation of one step."""
@@ -126,7 +129,10 @@ class GridSolver:
         values[0] = continued(value)
         if split:
             transport = Transport(problem, mesh, nodes[free], controls, problem.horizon / steps)
-            march = _in_turns(chain, transport, continued, value, problem.horizon, steps)
+            speed = speed_limit(problem, mesh, nodes[free], controls)
+            # A smoothed payoff does not jump at tau = 0.
+            first = 0 if problem.payoff.epsilon else math.ceil(FIRST * steps / (problem.horizon * speed))
+            march = _in_turns(chain, transport, continued, value, problem.horizon, steps, first)
         else:
             march = _together(chain, continued, value, problem.horizon, steps)
         for level, field, policy in march:
@@ -143,7 +149,7 @@ class GridSolver:
         steps = max(self.points) if self.steps is None else self.steps
         if not is_weak(self.problem, mesh, x, controls):
             return steps, False
-        needed = math.ceil(self.problem.horizon / longest_step(self.problem, mesh, x, controls))
+        needed = math.ceil(self.problem.horizon * speed_limit(self.problem, mesh, x, controls) / FARTHEST)
         most = MOST_STEPS * steps if self.steps is None else steps
         return (max(steps, needed), True) if needed <= most else (steps, False)
 
@@ -157,16 +163,29 @@ def _together(chain: Chain, continued: _Continuation, value: np.ndarray, horizon
 
 
 def _in_turns(
-    chain: Chain, transport: Transport, continued: _Continuation, value: np.ndarray, horizon: float, steps: int
+    chain: Chain,
+    transport: Transport,
+    continued: _Continuation,
+    value: np.ndarray,
+    horizon: float,
+    steps: int,
+    first: int,
 ) -> Iterator[Level]:
     """Steps in which drift and noise act in turns, from V (M,) at tau = 0.
 
-    Their lengths are equal, so that their paths are the same. V is noted at the times of all solutions.
+    Their lengths are equal, so that their paths are the same. V is noted at the times of all solutions. In the `first`
+    steps V is that of a control that is held, where the noise acts on the faces.
     """
+    noisy = transport.noise_acts_on_faces()
     after, policy, times = continued(value), np.zeros(len(value), int), steps * np.linspace(0, 1, steps + 1) ** 2
     for step in range(steps):
-        before, (moved, policy) = after, transport(after, policy)
-        after = continued(_solve(chain, moved, moved, np.zeros_like(policy), horizon / steps))
+        before = after
+        moved, policy = transport(after, policy)
+        value = _solve(chain, moved, moved, np.zeros_like(policy), horizon / steps)
+        if step < first:
+            held, best = transport.first(step + 1)
+            value, policy = np.where(noisy, held, value), np.where(noisy, best, policy)
+        after = continued(value)
         within = times - step
         for level in np.flatnonzero((within > 0) & (within <= 1)):
             yield int(level), (1 - within[level]) * before + within[level] * after, policy

@@ -9,8 +9,12 @@ has two parts instead. First V moves along the flow,
 a semi-Lagrangian step (M. Falcone and R. Ferretti, Semi-Lagrangian Approximation Schemes for Linear and Hamilton-Jacobi
 Equations, SIAM, 2013), where a path that enters A or B on its way has their value. Then the noise acts for the time dt,
 by the chain without drift. Between nodes V is a cubic spline that is limited to the values at the corners of the cell
-(R. Bermejo and A. Staniforth, Monthly Weather Review 120, 1992), so that it stays in [0, 1]. In a cell that a face cuts
-V follows from a short path, see `pirl_rl.grid.faces`.
+(R. Bermejo and A. Staniforth, Monthly Weather Review 120, 1992), so that it stays in [0, 1].
+
+At tau = 0 V jumps at the faces, and in the short time sigma^2 / |f|^2 the noise makes layers there that are thinner
+than a cell. A path that the flow leads to a face has crossed it earlier, on average, than at its end alone, and V keeps
+this lead for good. So in the first steps V is the probability of crossing the faces while a control is held, see
+`pirl_rl.crossings.passage_probability`.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, minimum_filter, spline_filter
 
+from pirl_rl.crossings import passage_probability, squared_noise
 from pirl_rl.grid.mesh import Mesh, absorbed
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.structure import has_controlled_noise
@@ -55,16 +60,15 @@ def is_weak(problem: ReachAvoidProblem, mesh: Mesh, x: np.ndarray, controls: np.
     return bool(((drift > WEAK * variance.sum(-1)).any(-1)).mean() > 0.5)
 
 
-def longest_step(problem: ReachAvoidProblem, mesh: Mesh, x: np.ndarray, controls: np.ndarray) -> float:
-    """The longest step, in s, in which most paths lead through at most `FARTHEST` cells.
+def speed_limit(problem: ReachAvoidProblem, mesh: Mesh, x: np.ndarray, controls: np.ndarray) -> float:
+    """The number of cells per s through which nine in ten paths lead, at most, from nodes x (M, n) with controls
+    (K, M, m).
 
-    One in ten of the paths from nodes x (M, n) with controls (K, M, m) may lead through more of them. Otherwise a few
-    states with large forces would make the steps of all too short.
+    The fastest of all would make steps too short, where a few states have large forces.
     """
     points = torch.from_numpy(x)
     drifts = (problem.drift(points, torch.from_numpy(np.ascontiguousarray(u))).numpy() for u in controls)
-    fastest = np.quantile([np.abs(drift / mesh.spacing).max(-1) for drift in drifts], 0.9)
-    return FARTHEST / max(fastest, 1e-12)
+    return max(float(np.quantile([np.abs(drift / mesh.spacing).max(-1) for drift in drifts], 0.9)), 1e-12)
 
 
 class Transport:
@@ -80,8 +84,27 @@ class Transport:
 
     def __init__(self, problem: ReachAvoidProblem, mesh: Mesh, x: np.ndarray, controls: np.ndarray, dt: float):
         self._mesh = mesh
-        points = torch.from_numpy(x)
-        self._feet = [_foot(problem, mesh, points, torch.from_numpy(np.ascontiguousarray(u)), dt) for u in controls]
+        self._problem, self._x, self._dt = problem, torch.from_numpy(x), dt
+        self._controls = [torch.from_numpy(np.ascontiguousarray(u)) for u in controls]
+        self._feet = []
+        for u in self._controls:
+            moved, ended, end = _flow(problem, mesh, self._x, u, dt)
+            self._feet.append((_place(mesh, moved), ended, end))
+
+    def first(self, steps: int) -> tuple[np.ndarray, np.ndarray]:
+        """V (M,) a few steps after tau = 0, while the best candidate is held, and the number (M,) of that candidate."""
+        value, best = np.full(len(self._x), -1.0), np.zeros(len(self._x), int)
+        for number, u in enumerate(self._controls):
+            moved, ended, end = _flow(self._problem, self._mesh, self._x, u, steps * self._dt)
+            passed = _passed(self._problem, self._x, moved, u, steps * self._dt, ended, end)
+            best, value = np.where(passed > value, number, best), np.maximum(passed, value)
+        return value, best
+
+    def noise_acts_on_faces(self) -> np.ndarray:
+        """Whether the noise moves the level of A, or that of B for invariance, at each node (M,) bool."""
+        problem, sigma = self._problem, self._problem.diffusion(self._x, self._controls[0])
+        level = problem.target_level if problem.objective == "reach-avoid" else problem.avoid_level
+        return (squared_noise(lambda y: level(y).unsqueeze(-1), self._x, sigma, 1)[:, 0] > 0).numpy()
 
     def __call__(self, field: np.ndarray, policy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """V one step further, and its policy.
@@ -121,11 +144,11 @@ class Transport:
         return field
 
 
-def _foot(problem: ReachAvoidProblem, mesh: Mesh, x: torch.Tensor, u: torch.Tensor, dt: float):
-    """Where paths without noise from x (M, n) end after dt.
+def _flow(problem: ReachAvoidProblem, mesh: Mesh, x: torch.Tensor, u: torch.Tensor, dt: float):
+    """Where paths without noise from x (M, n) are after dt.
 
     Returns:
-        Positions (n, M) in the padded mesh, whether the paths ended in A or B before (M,), and the value there (M,).
+        The states (M, n), whether the paths entered A or B before (M,), and the value of the first of these sets (M,).
     """
     cells = np.abs(problem.drift(x, u).numpy() / mesh.spacing).max() * dt
     looks = max(1, int(np.ceil(LOOKS * cells)))
@@ -136,7 +159,37 @@ def _foot(problem: ReachAvoidProblem, mesh: Mesh, x: torch.Tensor, u: torch.Tens
         inside, value = absorbed(problem, problem.states.wrap(x).numpy())
         end = np.where(inside & ~ended, value, end)
         ended = ended | inside
+    return x, ended, end
+
+
+def _place(mesh: Mesh, x: torch.Tensor) -> np.ndarray:
+    """The positions (n, M) of states x (M, n) in the padded mesh."""
     place = ((x.numpy() - mesh.low) / mesh.spacing).T
     for axis, count in enumerate(mesh.shape):
         place[axis] = place[axis] % count if axis in mesh.periodic else place[axis].clip(0, count - 1)
-    return place + PADDING, ended, end
+    return place + PADDING
+
+
+def _passed(
+    problem: ReachAvoidProblem,
+    x: torch.Tensor,
+    moved: torch.Tensor,
+    u: torch.Tensor,
+    dt: float,
+    ended: np.ndarray,
+    end: np.ndarray,
+) -> np.ndarray:
+    """The probability (M,) that paths from x (M, n) have succeeded after dt, with what `_flow` gives of them.
+
+    Paths that the flow leads through the whole of a set are in it for certain.
+    """
+    moved = problem.states.wrap(moved)
+    h, sigma, failed = torch.full_like(x[:, 0], dt), problem.diffusion(x, u), torch.zeros_like(x[:, 0])
+    through, end_ = torch.from_numpy(ended) & problem.interior(moved), torch.from_numpy(end)
+    if problem.has_avoid_set:
+        failed = 1 - (1 - passage_probability(problem.avoid_constraints, x, moved, sigma, h)).prod(-1)
+        failed = failed.masked_fill(through & (end_ == 0), 1.0)
+    if problem.objective != "reach-avoid":
+        return (1 - failed).numpy()
+    reached = passage_probability(lambda y: problem.target_level(y).unsqueeze(-1), x, moved, sigma, h).squeeze(-1)
+    return ((1 - failed) * reached.masked_fill(through & (end_ > 0), 1.0)).numpy()
