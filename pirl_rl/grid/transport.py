@@ -111,7 +111,8 @@ class Transport:
 
         With weak noise V is 1 in whole regions, whatever the next control is, until a path comes to the edge of the
         region, where the right control must be exact. So candidates are compared by a V that is blurred over a cell,
-        which shows the edge before, and where they are equal a node keeps the control with which V rose there.
+        which shows the edge before, and where they are equal a node keeps the control with which V rose there. V
+        itself is that of the best candidate or of the one that the node had, where that is larger.
 
         Args:
             field: V (N,) at all nodes, continued into A and B.
@@ -121,19 +122,31 @@ class Transport:
             W (M,), and the numbers (M,) of the best candidates.
         """
         padded = self._padded(field)
-        spline, blurred = spline_filter(padded, order=3, mode="mirror"), gaussian_filter(padded, BLUR, mode="nearest")
-        # The smallest and the largest value at the corners of each cell, noted at its first corner.
-        low, high = (extreme(padded, size=2, origin=-1) for extreme in (minimum_filter, maximum_filter))
-        value, best, seen = np.zeros(len(policy)), policy, np.full(len(policy), -np.inf)
-        kept = np.zeros(len(policy))
+        blurred = gaussian_filter(padded, BLUR, mode="nearest")
+        best, seen, kept = policy, np.full(len(policy), -np.inf), np.zeros(len(policy))
         for number, (place, ended, end) in enumerate(self._feet):
-            cell = tuple(np.floor(place).astype(int))
-            moved = map_coordinates(spline, place, order=3, prefilter=False, mode="nearest").clip(low[cell], high[cell])
-            value = np.maximum(value, np.where(ended, end, moved).clip(0, 1))
             vague = np.where(ended, end, map_coordinates(blurred, place, order=1, prefilter=False, mode="nearest"))
             kept = np.where(policy == number, vague, kept)
             best, seen = np.where(vague > seen, number, best), np.maximum(vague, seen)
+        value = self._moved(padded, [best, policy]).max(0)
         return value, np.where(seen > kept + GAIN, best, policy)
+
+    def _moved(self, padded: np.ndarray, choices: list[np.ndarray]) -> np.ndarray:
+        """V (k, M) at the ends of the paths of k choices of a candidate (M,) for each node."""
+        spline = spline_filter(padded, order=3, mode="mirror")
+        # The smallest and the largest value at the corners of each cell, noted at its first corner.
+        low, high = (extreme(padded, size=2, origin=-1) for extreme in (minimum_filter, maximum_filter))
+        values = []
+        for choice in choices:
+            place, stopped = np.empty((padded.ndim, len(choice))), np.full(len(choice), np.nan)
+            for number, (foot, ended, end) in enumerate(self._feet):
+                chosen = choice == number
+                place[:, chosen] = foot[:, chosen]
+                stopped[chosen & ended] = end[chosen & ended]
+            cell = tuple(np.floor(place).astype(int))
+            moved = map_coordinates(spline, place, order=3, prefilter=False, mode="nearest").clip(low[cell], high[cell])
+            values.append(np.where(np.isnan(stopped), moved, stopped).clip(0, 1))
+        return np.stack(values)
 
     def _padded(self, field: np.ndarray) -> np.ndarray:
         field = field.reshape(self._mesh.shape)
