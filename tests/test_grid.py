@@ -11,6 +11,7 @@ from torch import Tensor
 
 from benchmarks.kinds import Bicycle, Crosswind, Gusty, Loiter
 from pirl_rl import Box, ReachAvoidProblem
+from pirl_rl.crossings import first_passage
 from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.grid import GridSolution, GridSolver
@@ -362,6 +363,38 @@ def test_weak_noise_in_three_dimensions_has_its_closed_form():
 def test_weak_noise_in_fewer_dimensions_has_its_closed_form(dim, count, tolerance):
     """Drift and noise together have errors of 0.011 and 0.031, and 0.0036 and 0.0014 with plain first steps."""
     problem = Calm(dim)
+    tau, x = points(problem, 1_000)
+    solution = GridSolver(problem, points=count).solve()
+    assert solution.split
+    assert (solution.value(tau, x) - problem.exact_value(tau, x)).abs().mean() < tolerance
+
+
+class Adrift(ReachAvoidProblem):
+    """A current of 1 leads to a wall at x_1 = 1, against a control of at most 1/2; V is the chance not to reach it."""
+
+    objective, horizon, sigma = "invariance", 1.0, 0.1
+
+    def __init__(self, dim: int):
+        super().__init__()
+        self.states, self.controls = Box([-1.0] * dim, [1.2] * dim), Box([-0.5], [0.5])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.cat([1 + u, torch.zeros_like(x[..., 1:])], -1)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return (self.sigma * torch.eye(x.shape[-1], dtype=x.dtype)).expand(*x.shape, x.shape[-1])
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        return 1 - x[..., 0]
+
+    def exact_value(self, tau: Tensor, x: Tensor) -> Tensor:
+        return 1 - first_passage(tau, self.avoid_level(x), 0.5, self.sigma)
+
+
+@pytest.mark.parametrize(("dim", "count", "tolerance"), [(1, 41, 0.002), (2, 41, 0.002)])
+def test_weak_noise_beside_a_wall_to_avoid_has_its_closed_form(dim, count, tolerance):
+    """With plain first steps the errors are 0.009 and 0.008."""
+    problem = Adrift(dim)
     tau, x = points(problem, 1_000)
     solution = GridSolver(problem, points=count).solve()
     assert solution.split
