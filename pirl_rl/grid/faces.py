@@ -29,15 +29,15 @@ LENGTH = 1.0
 STATES = 2_000
 """The number of states whose paths are held in memory together."""
 
-Field = Callable[[Tensor, Tensor], Tensor]
+Function = Callable[[Tensor, Tensor], Tensor]
 """A function of tau (P,) and x (P, n), such as V or a policy."""
 
 
 def mean_beyond_faces(
     problem: ReachAvoidProblem,
     spacing: Tensor,
-    policy: Field,
-    value: Field,
+    policy: Function,
+    value: Function,
     near: Callable[[Tensor], Tensor],
     tau: Tensor,
     x: Tensor,
@@ -68,7 +68,7 @@ def mean_beyond_faces(
     return torch.cat(means)
 
 
-def _mean(problem, spacing, policy: Field, value: Field, near, normal: Tensor, tau: Tensor, x: Tensor) -> Tensor:
+def _mean(problem, spacing, policy: Function, value: Function, near, normal: Tensor, tau: Tensor, x: Tensor) -> Tensor:
     """`mean_beyond_faces` of a few states, with the normal numbers (paths, steps, w) of the noise."""
     paths = len(normal)
     left, at = tau.repeat_interleave(paths), x.repeat_interleave(paths, 0)
@@ -87,7 +87,7 @@ def _mean(problem, spacing, policy: Field, value: Field, near, normal: Tensor, t
     return result.reshape(len(x), paths).mean(-1)
 
 
-def _step(problem: ReachAvoidProblem, spacing: Tensor, policy: Field, tau: Tensor, x: Tensor, normal: Tensor):
+def _step(problem: ReachAvoidProblem, spacing: Tensor, policy: Function, tau: Tensor, x: Tensor, normal: Tensor):
     """Where paths from x (P, n) are after a step with the noise (P, w), its length (P,) in s, and the probabilities,
     each (P,), that they have crossed into A or B on the way."""
     u = policy(tau, x)

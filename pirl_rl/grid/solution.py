@@ -4,23 +4,18 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Mapping
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.ndimage import maximum_filter
 from torch import Tensor
 
 from pirl_rl.errors import ArgumentError, CheckpointError
 from pirl_rl.files import replacing
 from pirl_rl.grid.faces import mean_beyond_faces
-from pirl_rl.grid.mesh import Mesh, absorbed
+from pirl_rl.grid.field import Field
+from pirl_rl.grid.mesh import Mesh
 from pirl_rl.problem import ReachAvoidProblem
-
-ROUNDING = 1e-4
-"""The share of the horizon by which tau may exceed it, because tau may be rounded to float32."""
-
 
 SMALLEST = 1e-6
 """The smallest V, and 1 - V, whose log-odds are extrapolated. V itself is known to 1e-7 in each step."""
@@ -42,8 +37,7 @@ class GridSolution:
     Args:
         problem: the physics.
         mesh: the nodes.
-        values: V (steps + 1, N) at tau = horizon * (k / steps)^2. At nodes in A and B it is continued from outside, so
-            that the interpolated V takes the value of the set at its face.
+        values: V (steps + 1, N) at the nodes, see `pirl_rl.grid.field.Field`.
         policy: numbers (steps + 1, M) of the best candidates at the nodes outside A and B.
         controls: candidate controls (K, M, m), in SI units.
         nearest: for every node (N,) the place, among the M nodes, of the nearest node outside A and B.
@@ -64,7 +58,8 @@ class GridSolution:
         split: bool = False,
     ):
         self.problem, self.mesh, self.coarse, self.split = problem, mesh, coarse, split
-        self._values, self._policy, self._controls, self._nearest = values, policy, controls, nearest
+        self.field = Field(problem, mesh, values)
+        self._policy, self._controls, self._nearest = policy, controls, nearest
 
     dtype, device = torch.float64, torch.device("cpu")
     """The kind of tensors that evaluators pass in, as they do for `pirl_rl.solution.Solution`."""
@@ -72,7 +67,7 @@ class GridSolution:
     @property
     def steps(self) -> int:
         """The number of steps in tau."""
-        return len(self._values) - 1
+        return len(self.field.values) - 1
 
     def save(self, path: Path) -> None:
         """Write the solution, without its problem, to one file of numpy arrays.
@@ -113,7 +108,7 @@ class GridSolution:
             "spacing": mesh.spacing,
             "shape": np.array(mesh.shape),
             "periodic": np.array(mesh.periodic, int),
-            "values": self._values,
+            "values": self.field.values,
             "policy": self._policy,
             "controls": self._controls,
             "nearest": self._nearest,
@@ -186,7 +181,7 @@ class GridSolution:
             ArgumentError: a tau is outside [0, horizon].
         """
         largest, level, node = np.full(len(x), -1.0), np.zeros(len(x), int), np.zeros(len(x), int)
-        for time, corner, weight in self._corners(tau, x):
+        for time, corner, weight in self.field.corners(tau, x):
             heavier = weight > largest
             largest, level, node = (
                 np.where(heavier, new, old) for new, old in ((weight, largest), (time, level), (corner, node))
@@ -213,7 +208,7 @@ class GridSolution:
         error = self._distance(tau, x)
         if self.split:
             return torch.maximum(error, self._bend(tau, x))
-        cut = ~self.coarse._uncut(x)
+        cut = ~self.coarse.field.uncut(x)
         for nodes in self.mesh.corners(x[cut].detach().double().cpu().numpy())[0]:
             corners = torch.from_numpy(self.mesh.states(self.mesh.indices()[nodes])).to(x)
             distance = self._distance(tau[cut], corners).where(self.problem.interior(corners), 0.0)
@@ -222,13 +217,13 @@ class GridSolution:
 
     def _distance(self, tau: Tensor, x: Tensor) -> Tensor:
         """The distance (P,) of the interpolated V from that of the coarse solution."""
-        return (self._interpolated(tau, x) - self.coarse._interpolated(tau, x)).abs()  # type: ignore[union-attr]
+        return (self.field(tau, x) - self.coarse.field(tau, x)).abs()  # type: ignore[union-attr]
 
     def _bend(self, tau: Tensor, x: Tensor) -> Tensor:
         """The largest second difference (P,) of V, of those along the axes at x and one cell beside it."""
         largest = torch.zeros_like(tau, dtype=x.dtype)
         for step in torch.diag(torch.as_tensor(self.mesh.spacing).to(x)):
-            line = [self._interpolated(tau, self.problem.states.wrap(x + k * step)) for k in range(-2, 3)]
+            line = [self.field(tau, self.problem.states.wrap(x + k * step)) for k in range(-2, 3)]
             for behind, middle, ahead in zip(line, line[1:], line[2:], strict=False):
                 largest = torch.maximum(largest, (ahead - 2 * middle + behind).abs())
         return largest
@@ -247,66 +242,21 @@ class GridSolution:
         """V (P,) between the nodes, extrapolated where no face is near, and continued into A and B."""
         value = self._extrapolated(tau, x)
         if self.split:
-            near = self._near_faces(x) & self.problem.interior(x)
+            near = self.field.near_faces(x) & self.problem.interior(x)
             spacing = torch.as_tensor(self.mesh.spacing).to(x)
-            read = self.policy, self._extrapolated, self._near_faces
+            read = self.policy, self._extrapolated, self.field.near_faces
             value[near] = mean_beyond_faces(self.problem, spacing, *read, tau[near], x[near])
         return value
 
     def _extrapolated(self, tau: Tensor, x: Tensor) -> Tensor:
         """V (P,) between the nodes, extrapolated from both solutions in the cells of the coarse one without a face."""
-        fine = self._interpolated(tau, x)
+        fine = self.field(tau, x)
         if self.coarse is None:
             return fine
-        coarse = self.coarse._interpolated(tau, x)
+        coarse = self.coarse.field(tau, x)
         if self.split:
             odds, coarse_odds = (value.clamp(SMALLEST, 1 - SMALLEST).logit() for value in (fine, coarse))
             better = (odds + SHARE * (odds - coarse_odds)).sigmoid()
         else:
             better = 2 * fine - coarse
-        return torch.where(self.coarse._uncut(x), better, fine)
-
-    def _interpolated(self, tau: Tensor, x: Tensor) -> Tensor:
-        """V (P,) between the nodes, continued into A and B."""
-        result = np.zeros(len(x))
-        for time, node, weight in self._corners(tau, x):
-            result += weight * self._values[time, node]
-        return torch.from_numpy(result).to(x)
-
-    def _uncut(self, x: Tensor) -> Tensor:
-        """Whether all corners of the cells around states (P, n) lie outside A and B, (P,) bool."""
-        return ~self._any_corner(self._absorbed, x)
-
-    def _near_faces(self, x: Tensor) -> Tensor:
-        """Whether a face cuts the cells around states (P, n) or one of the cells beside them, (P,) bool."""
-        return self._any_corner(self._near_absorbed, x)
-
-    def _any_corner(self, nodes: np.ndarray, x: Tensor) -> Tensor:
-        """Whether a corner of the cells around states (P, n) is one of the nodes (N,) bool, (P,) bool."""
-        corners, _ = self.mesh.corners(x.detach().double().cpu().numpy())
-        return torch.from_numpy(nodes[corners].any(0)).to(x.device)
-
-    @cached_property
-    def _absorbed(self) -> np.ndarray:
-        """Which nodes lie in A or B, (N,) bool."""
-        return absorbed(self.problem, self.mesh.states(self.mesh.indices()))[0]
-
-    @cached_property
-    def _near_absorbed(self) -> np.ndarray:
-        """Which nodes lie in A or B or beside a node that does, (N,) bool."""
-        modes = ["wrap" if axis in self.mesh.periodic else "nearest" for axis in range(len(self.mesh.shape))]
-        near = maximum_filter(self._absorbed.reshape(self.mesh.shape), size=3, mode=modes)  # type: ignore[arg-type]
-        return near.ravel()
-
-    def _corners(self, tau: Tensor, x: Tensor):
-        """Time level, node and weight, each (P,), of every point that interpolation at tau (P,) and x (P, n) uses."""
-        horizon, last = self.problem.horizon, len(self._values) - 1
-        if not bool(((tau >= 0) & (tau <= horizon * (1 + ROUNDING))).all()):
-            raise ArgumentError(f"tau: expected 0 <= tau <= horizon = {horizon}, got {tau.min()} to {tau.max()}")
-        level = last * np.sqrt((tau.double().cpu().numpy() / horizon).clip(0, 1))
-        before = np.floor(level).astype(int).clip(0, last - 1)
-        share = level - before
-        nodes, weights = self.mesh.corners(x.detach().double().cpu().numpy())
-        for node, weight in zip(nodes, weights, strict=True):
-            yield before, node, weight * (1 - share)
-            yield before + 1, node, weight * share
+        return torch.where(self.coarse.field.uncut(x), better, fine)
