@@ -401,6 +401,31 @@ def test_weak_noise_beside_a_wall_to_avoid_has_its_closed_form(dim, count, toler
     assert (solution.value(tau, x) - problem.exact_value(tau, x)).abs().mean() < tolerance
 
 
+class Stop(ReachAvoidProblem):
+    """Come to rest at a place; the noise acts on the speed, whose level is the larger one at most states."""
+
+    horizon = 1.0
+    states, controls = Box([-0.1, -1.0], [0.1, 1.0]), Box([-1.0], [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.stack([x[..., 1], u[..., 0]], -1)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return x.new_tensor([[0.0], [0.6]]).expand(*x.shape, 1)
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return torch.stack([x[..., 0].abs() - 0.015, x[..., 1].abs() - 0.15], -1)
+
+
+def test_a_target_of_several_faces_is_entered_through_all_of_them():
+    """Noise soon brings the speed into its band, but not the place, which at speeds up to 0.25 is a time of 0.18 away."""
+    solution = GridSolver(Stop(), points=21, steps=150, estimate=False).solve()
+    assert solution.split
+    speed = torch.linspace(-0.25, 0.25, 11, dtype=torch.float64)
+    value = solution.value(torch.full((11,), 0.05, dtype=torch.float64), torch.stack([0 * speed + 0.06, speed], -1))
+    assert value.max() < 0.02
+
+
 def test_extrapolation_lowers_the_error_of_turns():
     problem = Calm()
     tau, x = points(problem, 1_000)

@@ -101,10 +101,14 @@ class Transport:
         return value, best
 
     def noise_acts_on_faces(self) -> np.ndarray:
-        """Whether the noise moves the level of A, or that of B for invariance, at each node (M,) bool."""
-        problem, sigma = self._problem, self._problem.diffusion(self._x, self._controls[0])
-        level = problem.target_level if problem.objective == "reach-avoid" else problem.avoid_level
-        return (squared_noise(lambda y: level(y).unsqueeze(-1), self._x, sigma, 1)[:, 0] > 0).numpy()
+        """Whether the noise moves every level of A that is above 0, or the level of B for invariance, (M,) bool."""
+        problem, x = self._problem, self._x
+        sigma = problem.diffusion(x, self._controls[0])
+        if problem.objective != "reach-avoid":
+            return (squared_noise(lambda y: problem.avoid_level(y).unsqueeze(-1), x, sigma, 1)[:, 0] > 0).numpy()
+        levels = problem.target_constraints(x)
+        moved = squared_noise(problem.target_constraints, x, sigma, levels.shape[-1]) > 0
+        return (moved | (levels <= 0)).all(-1).numpy()
 
     def __call__(self, field: np.ndarray, policy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """V one step further, and its policy.
@@ -204,5 +208,6 @@ def _passed(
         failed = failed.masked_fill(through & (end_ == 0), 1.0)
     if problem.objective != "reach-avoid":
         return (1 - failed).numpy()
-    reached = passage_probability(lambda y: problem.target_level(y).unsqueeze(-1), x, moved, sigma, h).squeeze(-1)
+    # Every constraint of A must hold, and the least probable one is that which matters.
+    reached = passage_probability(problem.target_constraints, x, moved, sigma, h).amin(-1)
     return ((1 - failed) * reached.masked_fill(through & (end_ > 0), 1.0)).numpy()
