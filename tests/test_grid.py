@@ -418,7 +418,7 @@ class Stop(ReachAvoidProblem):
 
 
 def test_a_target_of_several_faces_is_entered_through_all_of_them():
-    """Noise soon brings the speed into its band, but not the place, which at speeds up to 0.25 is a time of 0.18 away."""
+    """Noise soon brings the speed into its band, but not the place, which is a time of 0.18 away at a speed of 0.25."""
     solution = GridSolver(Stop(), points=21, steps=150, estimate=False).solve()
     assert solution.split
     speed = torch.linspace(-0.25, 0.25, 11, dtype=torch.float64)

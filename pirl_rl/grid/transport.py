@@ -208,6 +208,6 @@ def _passed(
         failed = failed.masked_fill(through & (end_ == 0), 1.0)
     if problem.objective != "reach-avoid":
         return (1 - failed).numpy()
-    # Every constraint of A must hold, and the least probable one is that which matters.
-    reached = passage_probability(problem.target_constraints, x, moved, sigma, h).amin(-1)
+    # Every constraint of A must hold; the noise of different faces is taken as independent.
+    reached = passage_probability(problem.target_constraints, x, moved, sigma, h).prod(-1)
     return ((1 - failed) * reached.masked_fill(through & (end_ > 0), 1.0)).numpy()
