@@ -265,5 +265,21 @@ def test_overlap_is_found_and_one_point_of_it_named(width):
         ProblemError, match=r"target and avoid set overlap.* of 1\d{5} sampled points.*x = \["
     ) as caught:
         check_problem(Overlap())
-    point = float(str(caught.value).split("x = [")[1].rstrip("]"))
+    point = float(str(caught.value).split("x = [")[1].split("]")[0])
     assert 2 <= point <= 2 + width
+
+
+def test_a_target_without_the_set_to_avoid_overlaps_no_more():
+    """The further constraint that the message of an overlap names, as the larger of two levels."""
+
+    class Overlap(Reach1D):
+        def avoid_level(self, x):
+            return (x[..., 0] - 2).abs() - 0.5
+
+    class Apart(Overlap):
+        def target_level(self, x):
+            return torch.maximum(super().target_level(x), -self.avoid_level(x))
+
+    with pytest.raises(ProblemError, match=r"further constraint -self\.avoid_level\(x\)"):
+        check_problem(Overlap())
+    check_problem(Apart())
