@@ -1,5 +1,6 @@
 """Problems of other kinds than those of the suite, each written as a user would write it."""
 
+from benchmarks.kinds.cycles import JetLag, PowerSwing, Runaway, Searchlight
 from benchmarks.kinds.masses import Crosswind, Gusty, Lander, Orbit, Servo, Sprint, VanDerPol
 from benchmarks.kinds.plants import Epidemic, Investor, Reservoir, Toggle, Tokens, TwoTanks
 from benchmarks.kinds.vehicles import Bicycle, Evader, Loiter, Ring, River, Slalom, Steering, TwoCars, TwoHarbours
@@ -7,6 +8,6 @@ from pirl_rl import ReachAvoidProblem
 
 KINDS: tuple[type[ReachAvoidProblem], ...] = (Servo, Steering, Evader, Gusty, TwoTanks, Reservoir, Slalom, Orbit, Ring)
 KINDS += (VanDerPol, TwoHarbours, River, Loiter, Crosswind, Bicycle, Tokens, Lander, Epidemic, Toggle, TwoCars, Sprint)
-KINDS += (Investor,)
+KINDS += (Investor, Runaway, JetLag, Searchlight, PowerSwing)
 
 PROBLEMS = {kind.__name__: kind for kind in KINDS}
