@@ -198,16 +198,14 @@ def _passed(
 ) -> np.ndarray:
     """The probability (M,) that paths from x (M, n) have succeeded after dt, with what `_flow` gives of them.
 
-    Paths that the flow leads through the whole of a set are in it for certain.
+    Paths that the flow leads into a set and out of it again have its value.
     """
     moved = problem.states.wrap(moved)
-    h, sigma, failed = torch.full_like(x[:, 0], dt), problem.diffusion(x, u), torch.zeros_like(x[:, 0])
-    through, end_ = torch.from_numpy(ended) & problem.interior(moved), torch.from_numpy(end)
+    h, sigma, alive = torch.full_like(x[:, 0], dt), problem.diffusion(x, u), torch.ones_like(x[:, 0])
     if problem.has_avoid_set:
-        failed = 1 - (1 - passage_probability(problem.avoid_constraints, x, moved, sigma, h)).prod(-1)
-        failed = failed.masked_fill(through & (end_ == 0), 1.0)
-    if problem.objective != "reach-avoid":
-        return (1 - failed).numpy()
-    # Every constraint of A must hold; the noise of different faces is taken as independent.
-    reached = passage_probability(problem.target_constraints, x, moved, sigma, h).prod(-1)
-    return ((1 - failed) * reached.masked_fill(through & (end_ > 0), 1.0)).numpy()
+        alive = (1 - passage_probability(problem.avoid_constraints, x, moved, sigma, h)).prod(-1)
+    if problem.objective == "reach-avoid":
+        # Every constraint of A must hold; the noise of different faces is taken as independent.
+        alive = alive * passage_probability(problem.target_constraints, x, moved, sigma, h).prod(-1)
+    inside = torch.where(torch.from_numpy(end > 0), problem.reached(moved), problem.failed(moved))
+    return np.where(ended & ~inside.numpy(), end, alive.numpy())
