@@ -11,7 +11,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from pirl_rl.crossings import _crossing_time, crosses_any, crossing_probability, enters_intersection, first_passage
+from pirl_rl.crossings import (
+    _crossing_time,
+    crosses_any,
+    crossing_probability,
+    enters_intersection,
+    first_passage,
+    passage_probability,
+)
 
 DEVIATION = 0.7
 PATHS = 200_000
@@ -164,3 +171,14 @@ def test_bridges_with_random_ends_cross_with_the_probability_of_a_first_passage(
     torch.testing.assert_close(crossed.mean(), passage, rtol=0, atol=1e-4)
     without_noise = crossing_probability(lambda y: y, moved.abs() + 1, moved.abs() + 2, sigma * 0, time)
     assert (without_noise == 0).all()
+
+
+def test_a_path_leaves_a_wall_with_its_exact_probability():
+    """With drift v away from a face at the distance a, 1 - exp(-2 a v / sigma^2) of the paths never cross it."""
+    a, v, s, h = torch.tensor([0.01, 0.1, 0.3], dtype=torch.float64), 1.0, 0.5, 50.0
+    x, moved = a[:, None], a[:, None] + v * h
+    sigma, time = torch.full((3, 1, 1), s, dtype=torch.float64), torch.full((3,), h, dtype=torch.float64)
+    crossed = passage_probability(lambda y: y, x, moved, sigma, time)
+    torch.testing.assert_close(crossed[:, 0], (-2 * a * v / s**2).exp(), rtol=0, atol=1e-6)
+    still = passage_probability(lambda y: y, x, x, sigma * 0, time)
+    assert (still == 0).all()

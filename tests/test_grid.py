@@ -16,6 +16,7 @@ from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.grid import GridSolution, GridSolver
 from pirl_rl.grid.candidates import candidates
+from pirl_rl.payoffs import LipschitzPayoff
 from pirl_rl.problems import (
     CartPole,
     DoubleIntegrator,
@@ -359,16 +360,6 @@ def test_weak_noise_in_three_dimensions_has_its_closed_form():
     assert errors[1] < 0.010
 
 
-@pytest.mark.parametrize(("dim", "count", "tolerance"), [(1, 101, 0.0008), (2, 41, 0.0020)])
-def test_weak_noise_in_fewer_dimensions_has_its_closed_form(dim, count, tolerance):
-    """Drift and noise together have errors of 0.011 and 0.031, and 0.0036 and 0.0014 with plain first steps."""
-    problem = Calm(dim)
-    tau, x = points(problem, 1_000)
-    solution = GridSolver(problem, points=count).solve()
-    assert solution.split
-    assert (solution.value(tau, x) - problem.exact_value(tau, x)).abs().mean() < tolerance
-
-
 class Adrift(ReachAvoidProblem):
     """A current of 1 leads to a wall at x_1 = 1, against a control of at most 1/2; V is the chance not to reach it."""
 
@@ -391,14 +382,27 @@ class Adrift(ReachAvoidProblem):
         return 1 - first_passage(tau, self.avoid_level(x), 0.5, self.sigma)
 
 
-@pytest.mark.parametrize(("dim", "count", "tolerance"), [(1, 41, 0.002), (2, 41, 0.002)])
-def test_weak_noise_beside_a_wall_to_avoid_has_its_closed_form(dim, count, tolerance):
-    """With plain first steps the errors are 0.009 and 0.008."""
-    problem = Adrift(dim)
+@pytest.mark.parametrize(
+    ("problem", "count", "tolerance"),
+    [(Calm(1), 101, 0.0008), (Calm(2), 41, 0.0020), (Adrift(1), 41, 0.002), (Adrift(2), 41, 0.002)],
+)
+def test_weak_noise_in_fewer_dimensions_has_its_closed_form(problem, count, tolerance):
+    """With plain first steps the errors are 0.0036, 0.0014, 0.009 and 0.008."""
     tau, x = points(problem, 1_000)
     solution = GridSolver(problem, points=count).solve()
     assert solution.split
     assert (solution.value(tau, x) - problem.exact_value(tau, x)).abs().mean() < tolerance
+
+
+def test_a_smoothed_payoff_moves_with_the_flow_in_the_first_steps():
+    """It does not jump at tau = 0. With weak noise V is l(d - tau) at the level d, as the flow has the speed 1."""
+    problem, tau = Calm(1), 0.02
+    problem.payoff = LipschitzPayoff(0.5)
+    solution = GridSolver(problem, points=101, estimate=False).solve()
+    assert solution.split
+    x = torch.linspace(-1.4, 1.4, 57, dtype=torch.float64)[:, None]
+    value = solution.value(torch.full((57,), tau, dtype=torch.float64), x)
+    assert (value - problem.payoff(problem.target_level(x) - tau)).abs().max() < 0.03
 
 
 class Stop(ReachAvoidProblem):
@@ -433,7 +437,7 @@ def test_extrapolation_lowers_the_error_of_turns():
     error, estimate = (solution.value(tau, x) - exact).abs(), solution.error(tau, x)
     assert (error <= estimate + 0.03).all()
     solution.coarse = None
-    assert error.mean() < 0.7 * (solution.value(tau, x) - exact).abs().mean()
+    assert error.mean() < 0.6 * (solution.value(tau, x) - exact).abs().mean()
 
 
 class Track(ReachAvoidProblem):
