@@ -119,8 +119,8 @@ def check_problem(problem: ReachAvoidProblem, points: int = 100_000, seed: int =
             point = [round(value, 6) for value in x[both][0].tolist()]
             raise ProblemError(
                 f"{name}: target and avoid set overlap, expected disjoint sets; {int(both.sum())} of {points} "
-                f"sampled points lie in both, for example x = {point}. If these are failures, give the target the "
-                "further constraint -self.avoid_level(x)"
+                f"sampled points lie in both, for example x = {point}. If points in both are failures, give the "
+                "target the further constraint -self.avoid_level(x)"
             )
     for axis in problem.states.periodic:
         _expect_period(problem, axis, x[:PERIOD_POINTS], problem.controls.sample(PERIOD_POINTS, rng, torch.float64))
