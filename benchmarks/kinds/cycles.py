@@ -34,7 +34,7 @@ class Runaway(ReachAvoidProblem):
 
 
 class JetLag(ReachAvoidProblem):
-    """Shift a body clock to the new day in four days by light, which helps or harms with the phase; in hours."""
+    """Shift a body clock to the new day by light, which helps or harms with the phase; in hours, over four days."""
 
     horizon = 4.0
     states, controls = Box([-12.0], [12.0], periodic=[0]), Box([0.0], [3.0])

@@ -16,6 +16,7 @@ from torch import Tensor
 from pirl_rl.crossings import crossing_probability
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sigma import times
+from pirl_rl.structure import noise_channels
 
 PATHS = 512
 """The number of paths from each state."""
@@ -58,7 +59,7 @@ def mean_beyond_faces(
         tau: times to go (P,), in s.
         x: states (P, n), in SI units.
     """
-    noises = problem.diffusion(x[:1], policy(tau[:1], x[:1])).shape[-1]
+    noises = noise_channels(problem)
     uniform = torch.quasirandom.SobolEngine(STEPS * noises, scramble=True, seed=0).draw(PATHS, dtype=torch.float64)
     normal = torch.special.ndtri(uniform.clamp(1e-9, 1 - 1e-9)).reshape(PATHS, STEPS, noises).to(x)
     means = [
@@ -68,7 +69,16 @@ def mean_beyond_faces(
     return torch.cat(means)
 
 
-def _mean(problem, spacing, policy: Function, value: Function, near, normal: Tensor, tau: Tensor, x: Tensor) -> Tensor:
+def _mean(
+    problem: ReachAvoidProblem,
+    spacing: Tensor,
+    policy: Function,
+    value: Function,
+    near: Callable[[Tensor], Tensor],
+    normal: Tensor,
+    tau: Tensor,
+    x: Tensor,
+) -> Tensor:
     """`mean_beyond_faces` of a few states, with the normal numbers (paths, steps, w) of the noise."""
     paths = len(normal)
     left, at = tau.repeat_interleave(paths), x.repeat_interleave(paths, 0)
