@@ -6,9 +6,9 @@
     --json FILE  the file of all results and of the machine, runs/benchmarks.json by default
     --store      make the ratios of this run those with which later runs are compared, in benchmarks/ratios.json
 
-Each benchmark runs in a process of its own with one thread. One that needs a package that is not installed is left out
-with a sentence. The results are written after each benchmark, so that an interrupted run leaves what it has measured. A
-ratio that has become worse gets a warning, and the exit status stays 0.
+Each benchmark runs in a process of its own with one thread. One that needs a package or a device that is not there is
+left out with a sentence. The results are written after each benchmark, so that an interrupted run leaves what it has
+measured. A ratio that has become worse gets a warning, and the exit status stays 0.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from benchmarks.ratios import STORED, compare, read, table
 from benchmarks.record import save
 
@@ -37,6 +39,7 @@ ALL = {
     "simulator": "simulator.py",
     "training profile": "training_profile.py",
     "population": "population.py",
+    "gpu": "gpu.py",
     "data parallel": "data_parallel.py",
     "collector, sync": "collectors.py collector=sync +experiment=reach1d --updates 1500 --seconds 20",
     "collector, multi_async": "collectors.py collector=multi_async collector.workers=2 +experiment=reach1d "
@@ -54,6 +57,9 @@ SHORT = {
     "simulator": "simulator.py --short",
 }
 """Those of the short version."""
+
+ON_GPU = {"gpu"}
+"""Those that need a CUDA device."""
 
 NEEDS = {"peers": ("stable_baselines3", "gymnasium"), "deployment": ("onnx", "onnxruntime", "onnxscript")}
 """The modules that a benchmark needs beside those of the package, by name."""
@@ -75,6 +81,9 @@ def run(commands: Mapping[str, str]) -> Iterator[tuple[str, dict[str, Any] | str
         missing = [module for module in NEEDS.get(name, ()) if importlib.util.find_spec(module) is None]
         if missing:
             yield name, f"The benchmark needs {' and '.join(missing)}, which this Python does not have."
+            continue
+        if name in ON_GPU and not torch.cuda.is_available():
+            yield name, "The benchmark needs a CUDA device, which this machine does not have."
             continue
         with tempfile.TemporaryDirectory() as folder:
             result, (file, *arguments) = Path(folder) / "record.json", shlex.split(command)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import copy
 import time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -24,7 +25,7 @@ import torch
 from benchmarks.record import save
 from benchmarks.time_to_accuracy import CLOCKS, PLAIN, Clocks
 from pirl_rl import checkpoint
-from pirl_rl.assembly import make_trainer
+from pirl_rl.assembly import choose, make_problem, make_trainer
 from pirl_rl.commands.composition import compose
 from pirl_rl.population import Population
 
@@ -36,7 +37,9 @@ class Measured(Exception):
     """All times are taken, so that the training can stop."""
 
 
-def train(members: int, settings: list[str], updates: int, threads: int, started: float) -> dict[str, float]:
+def train(
+    members: int, settings: list[str], updates: int, threads: int, started: float, warm_up: int = WARM_UP
+) -> dict[str, float]:
     """Train members side by side in this process.
 
     Args:
@@ -45,6 +48,7 @@ def train(members: int, settings: list[str], updates: int, threads: int, started
         updates: the number of updates whose time is taken.
         threads: the number of threads of torch.
         started: see `Clocks`.
+        warm_up: the number of updates before those whose time is taken.
 
     Returns:
         The start and the time for each member and update in seconds, by both clocks.
@@ -52,13 +56,19 @@ def train(members: int, settings: list[str], updates: int, threads: int, started
     clocks, read = Clocks(started), {}
     torch.set_num_threads(threads)
     trainers, numbers = [], []
+    config = compose("train", [*PLAIN, *settings])
+    choose(config, make_problem(config))
     for seed in range(members):
-        trainers.append(make_trainer(compose("train", [*settings, *PLAIN, f"seed={seed}"])))
+        own = copy.deepcopy(config)
+        own.seed = seed
+        trainers.append(make_trainer(own))
         numbers.append(checkpoint.global_rng_states())
-    step, last = trainers[0].collector.step, WARM_UP + updates
+    step, last = trainers[0].collector.step, warm_up + updates
 
     def timed_step(k: int) -> None:
         # The first member plays at the beginning of an update of all.
+        if k in (1, warm_up, last) and trainers[0].records:
+            torch.cuda.synchronize()  # a GPU works behind Python
         read[k] = clocks.read()
         if k == last:
             raise Measured
@@ -67,7 +77,7 @@ def train(members: int, settings: list[str], updates: int, threads: int, started
     trainers[0].collector.step = timed_step  # type: ignore[method-assign]
     with contextlib.suppress(Measured):
         trainers[0].train() if members == 1 else Population(trainers, numbers).train()
-    each = {f"update {name}": (read[last][name] - read[WARM_UP][name]) / (updates * members) for name in CLOCKS}
+    each = {f"update {name}": (read[last][name] - read[warm_up][name]) / (updates * members) for name in CLOCKS}
     return {f"start {name}": read[1][name] for name in CLOCKS} | each
 
 

@@ -20,7 +20,6 @@ from torch import Tensor
 from pirl_rl.arguments import Policy
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
-from pirl_rl.structure import has_controlled_noise
 
 Objective = Callable[[Tensor], Tensor]
 """Maps actions (N, m), normalised to [-1, 1], to numbers (N,), each of which depends on its own action alone.
@@ -129,7 +128,7 @@ def value_ahead(
         flow: replaces `simulator.flow`, compiled for example.
     """
     problem, clock, flow = solution.problem, simulator.clock, flow or simulator.flow
-    curvature = solution.hessian(tau, x) if has_controlled_noise(problem) else None
+    curvature = solution.hessian(tau, x) if simulator.controlled_noise else None
 
     def value(action: Tensor) -> Tensor:
         u, shape = problem.controls.denormalize(action), action.shape[:-1]

@@ -73,6 +73,14 @@ def make_problem(config: DictConfig, trust: Sequence[str] = ()) -> ReachAvoidPro
     return build(node, "env.problem", trust)
 
 
+def choose(config: DictConfig, problem: ReachAvoidProblem) -> str:
+    """Replace the settings `auto` of time steps, updates and paths; says why the trace is estimated, if it is."""
+    choose_time_steps(config, problem)
+    choose_updates(config, problem)
+    choose_paths(config, problem, make_evaluation_simulator(config, problem))
+    return choose_probes(config, problem)
+
+
 def make_trainer(
     config: DictConfig, folder: Path | None = None, trust: Sequence[str] = (), problem: ReachAvoidProblem | None = None
 ) -> Trainer:
@@ -95,10 +103,7 @@ def make_trainer(
     networks, physics, sampling, points = (int(word) for word in np.random.SeedSequence(seed).generate_state(4))
     torch.manual_seed(networks)
     problem = make_problem(config, trust) if problem is None else problem
-    choose_time_steps(config, problem)
-    choose_updates(config, problem)
-    choose_paths(config, problem, make_evaluation_simulator(config, problem))
-    reason = choose_probes(config, problem)
+    reason = choose(config, problem)
     supplied = {"problem": problem, "seed": physics, "device": device, "compile_simulator": config.compile}
     env: ReachAvoidEnv = build(_without(config, "env", "problem"), "env", trust, **supplied)
     parts = {"problem": problem, "simulator": env.simulator}

@@ -17,16 +17,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from pirl_rl import recording
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.initial_states import InitialStates, UniformStates
-from pirl_rl.sampling.supply import Supply
+from pirl_rl.sampling.supply import Stock, Supply
 from pirl_rl.simulator import Simulator, Step, exit_value
 from pirl_rl.structure import check_problem
 
@@ -45,6 +48,10 @@ class ReachAvoidEnv(EnvBase):
         device: the device of all tensors.
         compile_simulator: whether the simulator is compiled. Where that fails, it runs eagerly after one warning.
             (TorchRL's own argument `compile` would compile a whole step with its resets, which breaks into pieces.)
+
+    Attributes:
+        stocked: whether a step asks nothing of the device, as a recording of its kernels needs it, see `Stock`; this is
+            so on a GPU.
 
     Raises:
         ProblemError: the problem contradicts itself, see `check_problem`.
@@ -72,7 +79,7 @@ class ReachAvoidEnv(EnvBase):
         self.problem = problem
         self.simulator = Simulator(problem, dt, substeps, crossing, compile_simulator)  # type: ignore[arg-type]
         self._initial_states = initial_states or UniformStates()
-        self.supply = Supply(num_envs)
+        self.supply, self.stock, self.stocked = Supply(num_envs), Stock(), recording.records(self.device)
         self.max_steps = self.simulator.clock.max_steps
         self._make_specs()
         self.rng = torch.Generator(device=self.device)
@@ -87,12 +94,20 @@ class ReachAvoidEnv(EnvBase):
     def initial_states(self, distribution: InitialStates) -> None:
         if distribution is not self._initial_states:
             self._initial_states, self.supply = distribution, Supply(self.supply.size)
+            self.stock = Stock(self.stock.groups)
 
     def recipe(self, seed: int) -> Callable[[], ReachAvoidEnv]:
         """A picklable function that builds a copy of this environment on the CPU, with the given seed."""
         steps = {name: getattr(self.simulator, name) for name in ("dt", "substeps", "crossing")}
         others = {"initial_states": self.initial_states, "num_envs": self.batch_size[0], "seed": seed}
         return partial(ReachAvoidEnv, self.problem, **steps, **others, compile_simulator=bool(self.simulator.compile))
+
+    def joined(self, initial_states: InitialStates, copies: int, seed: int) -> ReachAvoidEnv:
+        """An environment on the same device with the paths of several copies of this one."""
+        make: Any = self.recipe(seed)
+        joint = make(initial_states=initial_states, num_envs=copies * self.batch_size[0], device=self.device)
+        joint.stock = Stock(copies)
+        return joint
 
     def _make_specs(self) -> None:
         problem, bs, device = self.problem, self.batch_size, self.device
@@ -116,7 +131,36 @@ class ReachAvoidEnv(EnvBase):
         TorchRL's method hides all states from `_reset`. Here the distribution of the initial states sees those of the
         paths that go on.
         """
+        if self.stocked:
+            return self._restarted(tensordict)
         return self.reset(tensordict, set_state=False) if self.any_done(tensordict) else tensordict
+
+    def stock_up(self, steps: int, visited: Tensor | None = None) -> None:
+        """Draw initial states for the episodes that begin within the next steps, if the environment is `stocked`.
+
+        Args:
+            steps: the number of steps.
+            visited: states (k, n) of the paths that are under way.
+        """
+        self.stock.fill(steps, self.batch_size[0], lambda count: self._draw(count, visited))
+
+    def _restarted(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The TensorDict with a new episode, from the stock, where one has ended."""
+        ended, tau, state = tensordict["done"], tensordict["tau"], tensordict["state"]
+        steps, started = self.stock.take(ended.squeeze(-1), lambda count: self._draw(count, state))
+        fresh = {
+            "tau": torch.where(ended, self.simulator.clock.time(steps).to(tau).unsqueeze(-1), tau),
+            "state": torch.where(ended, self.problem.states.wrap(started.to(state)), state),
+            "noise": torch.where(ended, 0.0, tensordict["noise"]),
+            "is_init": ended | tensordict["is_init"],
+            "done": torch.zeros_like(ended),
+            "terminated": torch.zeros_like(ended),
+        }
+        return tensordict.copy().update(fresh)
+
+    def _draw(self, count: int, visited: Tensor | None) -> tuple[Tensor, Tensor]:
+        dtype = torch.get_default_dtype()
+        return self.initial_states.sample(self.problem, count, self.max_steps, self.rng, dtype, visited)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         size, dtype = (*self.batch_size, self.problem.states.dim), torch.get_default_dtype()
@@ -127,10 +171,7 @@ class ReachAvoidEnv(EnvBase):
             ended = tensordict["_reset"].reshape(-1)
             tau, state = tensordict["tau"].clone(), tensordict["state"].clone()
             visited = state[~ended]
-        steps, started = self.supply.take(
-            int(ended.sum()),
-            lambda count: self.initial_states.sample(self.problem, count, self.max_steps, self.rng, dtype, visited),
-        )
+        steps, started = self.supply.take(int(ended.sum()), lambda count: self._draw(count, visited))
         tau[ended] = self.simulator.clock.time(steps).to(tau).unsqueeze(-1)
         state[ended] = self.problem.states.wrap(started.to(state))
         none = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
@@ -154,7 +195,9 @@ class ReachAvoidEnv(EnvBase):
         step = self.simulator.step(x, u, self.rng, dt=clock.length(steps, shortfall).squeeze(-1).to(x))
         terminated = (step.reached | step.failed).unsqueeze(-1) | (steps <= 1)
         reward, ends = torch.zeros_like(x[..., :1]), terminated.squeeze(-1)
-        if ends.any():  # the payoff of the few paths that end costs far less than that of all paths
+        if self.stocked:  # to ask which paths end costs more than the payoff of all
+            reward = torch.where(terminated, exit_value(self.problem, step).unsqueeze(-1), 0.0)
+        elif ends.any():  # the payoff of the few paths that end costs far less than that of all paths
             reward[ends] = exit_value(self.problem, Step(*(entry[ends] for entry in step))).unsqueeze(-1)
         return TensorDict(
             {
@@ -173,4 +216,4 @@ class ReachAvoidEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self.rng.manual_seed(seed)
-            self.supply = Supply(self.supply.size)
+            self.supply, self.stock = Supply(self.supply.size), Stock(self.stock.groups)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 from torchrl.collectors import Collector
@@ -16,6 +17,8 @@ __all__ = [
     "FusedSoftUpdate",
     "ScheduledTD3Loss",
     "carried",
+    "carry",
+    "generator_of",
     "lock_writes_with",
     "write_lock",
 ]
@@ -45,12 +48,28 @@ class FusedSoftUpdate(SoftUpdate):
         self._followers = [target[key] for target, source in pairs for key in source.keys(True, True)]
 
     def step(self) -> None:
-        get_ema_multi_avg_fn(self.eps)(self._followers, self._followed, None)
+        """Move the targets by the share 1 - `eps`, which may be a tensor."""
+        if isinstance(self.eps, float):
+            get_ema_multi_avg_fn(self.eps)(self._followers, self._followed, None)
+            return
+        moves = torch._foreach_sub(self._followed, self._followers)
+        torch._foreach_mul_(moves, 1 - self.eps)
+        torch._foreach_add_(self._followers, moves)
 
 
 def carried(collector: Collector) -> TensorDictBase:
     """The TensorDict that a collector keeps between steps, with the states of all environments."""
     return collector._carrier
+
+
+def carry(collector: Collector, tensordict: TensorDictBase) -> None:
+    """Replace the TensorDict that a collector keeps between steps."""
+    collector._carrier = tensordict
+
+
+def generator_of(buffer: TensorDictReplayBuffer) -> torch.Generator | None:
+    """The random generator with which a buffer is sampled."""
+    return buffer._rng
 
 
 def write_lock(buffer: TensorDictReplayBuffer) -> Any:

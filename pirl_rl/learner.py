@@ -10,12 +10,13 @@ import torch
 from tensordict import TensorDictBase, TensorDictParams
 from torch import Tensor
 
+from pirl_rl import recording
 from pirl_rl.curriculum import StageSettings
 from pirl_rl.errors import ArgumentError, DivergenceError
 from pirl_rl.gradients import Gradient, Gradients, Terms
 from pirl_rl.internals import FusedSoftUpdate
 from pirl_rl.losses import PIRLLoss
-from pirl_rl.optimizers import optimizers
+from pirl_rl.optimizers import optimizers, step_together
 from pirl_rl.schedules import WEIGHTS, Weights
 
 EXPLOSION = 1e6
@@ -72,11 +73,19 @@ class Learner:
             raise ArgumentError(f"learner.target_warmup: expected a number >= 0, got {target_warmup}")
         self.polyak, self.target_warmup = polyak, target_warmup
         self.targets = FusedSoftUpdate(loss, tau=polyak)
-        self.critic_optimizers = optimizers(loss.qvalue_network_params, learning_rate, optimizer)
-        self.actor_optimizers = optimizers(loss.actor_network_params, learning_rate, optimizer)
+        device, rate = loss.td_weight.device, learning_rate
+        self._largest: Tensor | None = None
+        if recording.records(device):
+            # What changes from one update to the next lies in memory that stays, for recordings of updates.
+            rate = torch.full((), learning_rate, device=device)
+            self.targets.eps = torch.full((), 1 - polyak, device=device)
+            self._largest = torch.zeros((), device=device)
+        self.critic_optimizers = optimizers(loss.qvalue_network_params, rate, optimizer)
+        self.actor_optimizers = optimizers(loss.actor_network_params, rate, optimizer)
+        self._prepared: dict[str, float] = {}
         self.train_actor = True
         self.gradients = Gradients(loss, compile)
-        self.loss_actor = torch.tensor(math.nan)
+        self.loss_actor = torch.full((), math.nan, device=device)
         self._moments_rule = _name(loss.actor_rule)
 
     def apply(self, settings: StageSettings) -> None:
@@ -108,50 +117,72 @@ class Learner:
 
         Raises:
             DivergenceError: a loss is not finite or too large; the networks are as before the step that it would make.
+                On a GPU `check` finds it.
         """
-        self.prepare(weights, decay)
+        self.prepare(weights, decay, k)
+        return self.make(batch, k)
+
+    def make(self, batch: TensorDictBase, k: int) -> dict[str, Tensor]:
+        """Make an update that is prepared; arguments, results and errors are those of `update`."""
         batch = self.loss.with_noise(batch)
-        terms = self.step_critics(self.gradients.critic(batch), k)
+        terms = self.lead_critics(self.gradients.critic(batch), k)
+        step_together(self.critic_optimizers)
         if k % self.actor_every == 0:
             if self.train_actor:
-                self.step_actor(self.gradients.actor(batch), k)
-            self.step_targets(k)
+                self.lead_actor(self.gradients.actor(batch), k)
+                step_together(self.actor_optimizers)
+            self.step_targets()
         return {**terms, "loss_actor": self.loss_actor}
 
-    # The next three are the parts of an update around the losses, which a population evaluates for all its members.
+    # The next four are the parts of an update around the losses, which a population evaluates for all its members.
 
-    def prepare(self, weights: Weights, decay: float) -> None:
-        """Set the loss weights and the learning rate of an update; arguments are those of `update`."""
-        for name, value in zip(WEIGHTS, weights, strict=True):
+    def prepare(self, weights: Weights, decay: float, k: int) -> None:
+        """Set the loss weights, the learning rate and the rate of the targets; arguments are those of `update`."""
+        numbers = dict(zip(WEIGHTS, weights, strict=True))
+        follow = max(self.polyak, self._early_rate(k // self.actor_every))
+        numbers |= {"learning_rate": self.rate(decay), "kept": 1 - follow}
+        for name, value in numbers.items():
+            if self._prepared.get(name) != value:
+                self._set(name, value)
+        self._prepared = numbers
+
+    def _set(self, name: str, value: float) -> None:
+        if name in WEIGHTS:
             setattr(self.loss, name, value)
-        for optimizer in (*self.critic_optimizers, *self.actor_optimizers):
-            optimizer.param_groups[0]["lr"] = self.rate(decay)
+        elif name == "kept":
+            self.targets.eps = recording.renewed(self.targets.eps, value)
+        else:
+            for optimizer in (*self.critic_optimizers, *self.actor_optimizers):
+                group = optimizer.param_groups[0]
+                group["lr"] = recording.renewed(group["lr"], value)
 
-    def step_critics(self, found: Gradient, k: int) -> Terms:
-        """Step the critics along the gradient of update `k`; returns the unweighted terms of the loss.
+    def lead_critics(self, found: Gradient, k: int) -> Terms:
+        """Give the critics the gradient of update `k`, for a step of `critic_optimizers`.
+
+        Returns:
+            The unweighted terms of the loss.
 
         Raises:
-            DivergenceError: the loss is not finite or too large; the networks stay as they are.
+            DivergenceError: the loss is not finite or too large. On a GPU `check` finds it.
         """
         loss, terms, gradient = found
-        _check(loss, terms, k + 1)
-        _descend(self.critic_optimizers, self.loss.qvalue_network_params, gradient)
+        self._judge(loss, terms, k + 1)
+        _lead(self.loss.qvalue_network_params, gradient)
         return terms
 
-    def step_actor(self, found: Gradient, k: int) -> None:
-        """Step the actor along the gradient of update `k`.
+    def lead_actor(self, found: Gradient, k: int) -> None:
+        """Give the actor the gradient of update `k`, for a step of `actor_optimizers`.
 
         Raises:
-            DivergenceError: the loss is not finite or too large; the networks stay as they are.
+            DivergenceError: the loss is not finite or too large. On a GPU `check` finds it.
         """
         loss, _, gradient = found
-        _check(loss, {"loss_actor": loss}, k + 1)
-        _descend(self.actor_optimizers, self.loss.actor_network_params, gradient)
-        self.loss_actor = loss
+        self._judge(loss, {"loss_actor": loss}, k + 1)
+        _lead(self.loss.actor_network_params, gradient)
+        self.loss_actor.copy_(loss)
 
-    def step_targets(self, k: int) -> None:
-        """Move the target networks towards the networks, in update `k`."""
-        self.targets.eps = 1 - max(self.polyak, self._early_rate(k // self.actor_every))
+    def step_targets(self) -> None:
+        """Move the target networks towards the networks."""
         self.targets.step()
 
     def _early_rate(self, count: int) -> float:
@@ -163,12 +194,25 @@ class Learner:
         fraction = 1.0 if self.decay == "constant" else (1 + math.cos(math.pi * min(decay, 1.0))) / 2
         return self.learning_rate * fraction
 
-    def check_parameters(self, update: int) -> None:
-        """Refuse parameters that are not finite: a finite loss may have had an infinite gradient.
+    def _judge(self, loss: Tensor, terms: Terms, update: int) -> None:
+        """Refuse a loss at once, or on a GPU, which works ahead of Python, note it for `check`."""
+        if self._largest is None:
+            _check(loss, terms, update)
+        else:
+            size = loss.detach().abs().nan_to_num(nan=math.inf, posinf=math.inf)
+            torch.maximum(self._largest, size, out=self._largest)
+
+    def check(self, update: int) -> None:
+        """Refuse losses and parameters that are not finite: a finite loss may have had an infinite gradient.
 
         Raises:
-            DivergenceError: a parameter is not finite; the message names it and the update.
+            DivergenceError: a loss since the last check is not finite or too large, or a parameter is not finite; the
+                message names it and the update.
         """
+        if self._largest is not None:
+            if not self._largest.item() < EXPLOSION:
+                raise DivergenceError(f"update {update}: a loss is not finite or above {EXPLOSION:.0e}")
+            self._largest.zero_()
         for name, parameter in self.loss.named_parameters():
             if not parameter.isfinite().all():
                 raise DivergenceError(f"update {update}: the parameter {name} is not finite")
@@ -178,13 +222,14 @@ class Learner:
             "loss": self.loss.state_dict(),
             "loss_actor": self.loss_actor,
             "actor_rule": self._moments_rule,
-            "critic_optimizers": [optimizer.state_dict() for optimizer in self.critic_optimizers],
-            "actor_optimizers": [optimizer.state_dict() for optimizer in self.actor_optimizers],
+            "critic_optimizers": [_state(optimizer) for optimizer in self.critic_optimizers],
+            "actor_optimizers": [_state(optimizer) for optimizer in self.actor_optimizers],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.loss.load_state_dict(state["loss"])
-        self.loss_actor, self._moments_rule = state["loss_actor"], state["actor_rule"]
+        self.loss_actor.copy_(state["loss_actor"])
+        self._moments_rule = state["actor_rule"]
         for name in ("critic_optimizers", "actor_optimizers"):
             if len(own := getattr(self, name)) != len(state[name]):
                 raise ArgumentError(
@@ -192,7 +237,8 @@ class Learner:
                     f"network, expected {len(own)}; its run had another setting"
                 )
             for optimizer, saved in zip(own, state[name], strict=True):
-                optimizer.load_state_dict(saved)
+                optimizer.load_state_dict(saved | {"param_groups": _adapted(optimizer, saved["param_groups"])})
+        self._prepared = {}
 
 
 def _check(loss: Tensor, terms: Terms, update: int) -> None:
@@ -203,15 +249,26 @@ def _check(loss: Tensor, terms: Terms, update: int) -> None:
     raise DivergenceError(f"update {update}: {worst} is not finite or above {EXPLOSION:.0e}: {found}")
 
 
-def _descend(
-    optimizers: Sequence[torch.optim.Optimizer], params: TensorDictParams, gradient: Sequence[Tensor | None]
-) -> None:
-    """Make a step of each optimiser along the gradient in the parameters."""
+def _lead(params: TensorDictParams, gradient: Sequence[Tensor | None]) -> None:
+    """Give parameters their gradient."""
     for parameter, entry in zip(params.parameters(), gradient, strict=True):
         # Fused optimisers read a gradient in the order of the memory of its parameter.
         parameter.grad = None if entry is None else entry.contiguous()
-    for optimizer in optimizers:
-        optimizer.step()
+
+
+def _state(optimizer: torch.optim.Optimizer) -> dict[str, Any]:
+    """The state of an optimiser, with the learning rate as a number on all devices."""
+    state = optimizer.state_dict()
+    return state | {"param_groups": [group | {"lr": float(group["lr"])} for group in state["param_groups"]]}
+
+
+def _adapted(optimizer: torch.optim.Optimizer, saved: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Saved settings of an optimiser, which may come from another device, for the device of this one."""
+    groups = []
+    for own, group in zip(optimizer.param_groups, saved, strict=True):
+        device_settings = {"capturable": own["capturable"]} if "capturable" in own else {}
+        groups.append({**group, **device_settings, "lr": recording.renewed(own["lr"], group["lr"])})
+    return groups
 
 
 def _name(rule: object) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -19,19 +20,22 @@ COEFFICIENTS = (3.4445, -4.7750, 2.0315)
 ITERATIONS = 5
 
 
-def optimizers(params: TensorDictParams, rate: float, kind: Literal["adam", "muon"]) -> list[torch.optim.Optimizer]:
+def optimizers(
+    params: TensorDictParams, rate: float | Tensor, kind: Literal["adam", "muon"]
+) -> list[torch.optim.Optimizer]:
     """The optimisers of a network, or of several whose parameters are stacked along a leading axis.
 
     Args:
         params: the parameters of an `Actor` or of a `Critic`.
-        rate: the learning rate.
+        rate: the learning rate. A tensor on a GPU can be changed in place, also where steps are recorded as a graph.
         kind: "adam" takes Adam for all parameters. "muon" takes Muon for the weights between hidden layers, and Adam
             for the biases and for the weights of the first and the last layer.
     """
     named = dict(params.named_parameters())
     weights = sorted((name for name in named if name.endswith("weight")), key=lambda name: int(name.split(".")[-2]))
     hidden = weights[1:-1] if kind == "muon" else []
-    adam = torch.optim.Adam([parameter for name, parameter in named.items() if name not in hidden], rate, fused=True)
+    others = [parameter for name, parameter in named.items() if name not in hidden]
+    adam = torch.optim.Adam(others, rate, fused=True, capturable=isinstance(rate, Tensor))
     return [adam, Muon([named[name] for name in hidden], rate)] if hidden else [adam]
 
 
@@ -48,26 +52,44 @@ class Muon(torch.optim.Optimizer):
         lr: the learning rate of Adam that would suit the same network; steps are `RATE` times as long.
     """
 
-    def __init__(self, weights: list[nn.Parameter], lr: float):
+    def __init__(self, weights: list[nn.Parameter], lr: float | Tensor):
         super().__init__(weights, {"lr": lr})
 
-    @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
-        for group in self.param_groups:
-            # Matrices of one shape are made orthogonal together, which costs less than one after another.
-            for shape in dict.fromkeys(weight.shape for weight in group["params"]):
-                weights = [weight for weight in group["params"] if weight.shape == shape]
-                out, into = shape[-2:]
-                length = RATE * group["lr"] * max(1.0, out / into) ** 0.5
-                directions = orthogonal(torch.stack([self._direction(weight, weight.grad) for weight in weights]))
-                for weight, direction in zip(weights, directions, strict=True):
-                    weight.sub_(direction, alpha=length)
+        step_together([self])
 
-    def _direction(self, weight: Tensor, gradient: Tensor) -> Tensor:
-        """Nesterov's momentum of a weight, after a gradient has been added to it."""
-        momentum = self.state[weight].setdefault("momentum", torch.zeros_like(weight))
-        momentum.lerp_(gradient, 1 - MOMENTUM)
-        return gradient.lerp(momentum, MOMENTUM)
+    def momentum(self, weight: Tensor) -> Tensor:
+        """The running mean of the gradients of a weight, which may be changed in place."""
+        return self.state[weight].setdefault("momentum", torch.zeros_like(weight))
+
+
+@torch.no_grad()
+def step_together(optimizers: Sequence[torch.optim.Optimizer]) -> None:
+    """A step of each optimiser, with the matrices of all instances of `Muon` in common operations."""
+    muons = [one for one in optimizers if isinstance(one, Muon)]
+    for other in optimizers:
+        if not isinstance(other, Muon):
+            other.step()
+    owned = [(one, weight) for one in muons for weight in one.param_groups[0]["params"]]
+    # Matrices of one shape are made orthogonal together, which costs less than one after another.
+    for shape in dict.fromkeys(weight.shape for _, weight in owned):
+        mine = [(one, weight) for one, weight in owned if weight.shape == shape]
+        weights, gradients = [weight for _, weight in mine], [weight.grad for _, weight in mine]
+        momenta = [one.momentum(weight) for one, weight in mine]
+        torch._foreach_lerp_(momenta, gradients, 1 - MOMENTUM)
+        # Nesterov's momentum, after the gradient has been added to it.
+        directions = orthogonal(torch.stack(torch._foreach_lerp(gradients, momenta, MOMENTUM)))
+        out, into = shape[-2:]
+        rates = [one.param_groups[0]["lr"] for one, _ in mine]
+        lengths = RATE * max(1.0, out / into) ** 0.5 * _column(rates, directions)
+        torch._foreach_sub_(weights, (directions * lengths).unbind())
+
+
+def _column(numbers: Sequence[float | Tensor], like: Tensor) -> Tensor:
+    """Numbers, or tensors () on a device, as a tensor (N, 1, ...) with the axes of another."""
+    tensors = [number for number in numbers if isinstance(number, Tensor)]
+    column = torch.stack(tensors) if tensors else like.new_tensor(numbers)
+    return column.reshape(-1, *[1] * (like.ndim - 1))
 
 
 def orthogonal(matrix: Tensor) -> Tensor:

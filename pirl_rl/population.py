@@ -12,6 +12,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -19,11 +20,16 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from pirl_rl import checkpoint
+from pirl_rl.collectors import SyncCollector
+from pirl_rl.collectors.joint import JointPlayer
 from pirl_rl.compilation import Compiled
 from pirl_rl.errors import ArgumentError, DivergenceError, Interrupted
 from pirl_rl.gradients import Gradient, Terms
 from pirl_rl.losses import TERMS, PIRLLoss
+from pirl_rl.optimizers import step_together
 from pirl_rl.progress import Progress, announce, interruptible
+from pirl_rl.recording import Recordings
+from pirl_rl.schedules import Weights
 from pirl_rl.terms import Networks
 from pirl_rl.trainer import Trainer
 
@@ -66,6 +72,8 @@ class Population:
         self.members, self._numbers = members, list(numbers)
         self.errors: dict[int, DivergenceError] = {}
         self._losses = StackedLosses(members[0].learner.gradients.compile)
+        self._records = all(member.records for member in members)
+        self._recordings = Recordings("an update", [rng for member in members for rng in member.generators])
 
     def train(self) -> list[dict[str, float] | None]:
         """Train all members to the last update and evaluate them.
@@ -76,8 +84,10 @@ class Population:
         Raises:
             Interrupted: on SIGINT, after a checkpoint of each member.
         """
+        joint = None
         try:
             with interruptible() as interrupted:
+                joint = self._join()
                 for index, member in enumerate(self.members):
                     with self._as_alone(index):
                         member.open()
@@ -88,12 +98,24 @@ class Population:
         finally:
             for member in self.members:
                 member.close()
+            if joint:
+                joint.close()
         summaries: list[dict[str, float] | None] = [None] * len(self.members)
         for index, member in enumerate(self.members):
             if index not in self.errors:
                 with self._as_alone(index):
                     summaries[index] = member.finish()
         return summaries
+
+    def _join(self) -> JointPlayer | None:
+        """Let the members play together on a GPU; on a CPU this gains nothing."""
+        collectors = [member.collector for member in self.members]
+        if not self._records or not all(isinstance(one, SyncCollector) for one in collectors):
+            return None
+        joint = JointPlayer(collectors)  # type: ignore[arg-type]
+        for index, collector in enumerate(collectors):
+            collector.source = partial(joint.part, index)  # type: ignore[union-attr]
+        return joint
 
     def _loop(self, interrupted: Callable[[], bool]) -> None:
         updates = self.members[0].updates
@@ -116,46 +138,70 @@ class Population:
         due = [index for index in self._active() if self.members[index].update == k]
         if not due:
             return []
+        weights = [self._arrive(index, k) for index in due]
+
+        def make() -> dict[int, Terms]:
+            return self._make(due, weights, k)
+
+        kinds = (self.members[index].kind(k, own) for index, own in zip(due, weights, strict=True))
+        terms = self._recordings((*due, *kinds), make) if self._records else make()
+        rows = []
+        for index in due:
+            if index in terms and index not in self.errors and not self.members[index].ended:
+                with self._as_alone(index):
+                    rows.append(self.members[index].record(k, terms[index]))
+                    self.members[index].keep(stop=False)
+        return rows
+
+    def _make(self, due: Sequence[int], weights: Sequence[Weights], k: int) -> dict[int, Terms]:
+        """Make update `k` of members at which all of them have arrived; returns the terms of those that make it."""
         learners = [self.members[index].learner for index in due]
         losses = [learner.loss for learner in learners]
-        batches = [self._draw(index, k) for index in due]
+        batches = [self._draw(index, own) for index, own in zip(due, weights, strict=True)]
         batch: TensorDictBase = TensorDict.stack(_completed(batches))  # pyright: ignore[reportAssignmentType]
         terms: dict[int, Terms] = {}
         for index, gradient in zip(due, self._losses("critic", losses, batch), strict=True):
             with self._ending(index):
-                terms[index] = self.members[index].learner.step_critics(gradient, k)
+                terms[index] = self.members[index].learner.lead_critics(gradient, k)
+        step_together([one for index in terms for one in self.members[index].learner.critic_optimizers])
         if k % learners[0].actor_every == 0:
             # Rules of the actor take a batch with collocation points in another way than one without.
             within = ["collocation" in own.keys() for own in batches]
             kinds = {True: batch, False: batch.exclude("collocation")} if learners[0].train_actor else {}
             gradients = {kind: self._losses("actor", losses, kinds[kind]) for kind in kinds if kind in within}
+            led = []
             for i, (index, learner) in enumerate(zip(due, learners, strict=True)):
                 with self._ending(index):
                     if index in terms and gradients:
-                        learner.step_actor(gradients[within[i]][i], k)
+                        learner.lead_actor(gradients[within[i]][i], k)
                     if index in terms:
-                        learner.step_targets(k)
-        rows = []
+                        led.append(learner)
+            step_together([one for learner in led if gradients for one in learner.actor_optimizers])
+            for learner in led:
+                learner.step_targets()
+        made = {}
         for index, learner, own in zip(due, learners, batches, strict=True):
-            if index in self._active():
+            if index in terms:
                 found = {name: value for name, value in terms[index].items() if PARTS[name] in own.keys(True)}
-                with self._as_alone(index):
-                    rows.append(self.members[index].record(k, found | {"loss_actor": learner.loss_actor}))
-                    self.members[index].keep(stop=False)
-        return rows
+                made[index] = found | {"loss_actor": learner.loss_actor}
+        return made
 
-    def _draw(self, index: int, k: int) -> TensorDictBase:
-        """Prepare update `k` of a member; returns its batch with the random numbers of its losses."""
+    def _arrive(self, index: int, k: int) -> Weights:
+        """Collect what is due before update `k` of a member, and prepare it; returns the loss weights of the member."""
         member = self.members[index]
         with self._as_alone(index):
-            batch, weights, decay = member.draw(k)
-            batch = member.learner.loss.with_noise(batch)
+            weights = member.arrive(k)
         # A term for which this member has no part of a batch has the weight 0, see `_completed`.
-        td, hjb, boundary = (
-            w if part in batch.keys(True) else 0.0 for w, part in zip(weights, PARTS.values(), strict=True)
-        )
-        member.learner.prepare((td, hjb, boundary), decay)
-        return batch
+        parts = member.batches.parts(weights)
+        td, hjb, boundary = (w if part else 0.0 for w, part in zip(weights, parts, strict=True))
+        member.learner.prepare((td, hjb, boundary), member.curriculum.decay(k), k)
+        return weights
+
+    def _draw(self, index: int, weights: Weights) -> TensorDictBase:
+        """The batch of a member with the random numbers of its losses."""
+        member = self.members[index]
+        with self._as_alone(index):
+            return member.learner.loss.with_noise(member.draw(weights))
 
     def _active(self) -> list[int]:
         """The members whose training goes on."""
@@ -174,7 +220,15 @@ class Population:
 
     @contextmanager
     def _as_alone(self, index: int) -> Iterator[None]:
-        """Draw the random numbers that the member would draw if it were trained alone."""
+        """Draw the random numbers that the member would draw if it were trained alone.
+
+        Where updates are recorded, the members share torch's default random generator. It gives the noise on actions,
+        and all else comes from generators of the members.
+        """
+        if self._records:
+            with self._ending(index):
+                yield
+            return
         checkpoint.restore_global_rngs(self._numbers[index])
         with self._ending(index):
             yield
@@ -235,7 +289,7 @@ class StackedLosses:
         empty: list[Any] = [copy.deepcopy(loss.qvalue_network) for _ in range(3)]
         empty += [copy.deepcopy(loss.actor_network) for _ in range(2)]
         critic, frozen, target_critic, actor, target_actor = empty
-        kept = {"preserve_module_state": False}
+        kept, position = {"preserve_module_state": False}, int(which == "actor")
 
         def of_member(params: Sequence[TensorDictBase], weights: Sequence[Tensor], batch: TensorDictBase):
             with (
@@ -249,7 +303,7 @@ class StackedLosses:
                 return function(batch, Networks(*critics, actor.module, target_actor.module, weights))
 
         def program(params: Sequence[TensorDictBase], weights: Sequence[Tensor], batch: TensorDictBase) -> Gradient:
-            trained = [params[which == "actor"][key] for key in keys]
+            trained = [params[position][key] for key in keys]
             found, terms = torch.func.vmap(of_member)(params, weights, batch)
             # A member's loss depends on its own parameters alone, so that the sum has the gradients of all.
             return found.detach(), terms, torch.autograd.grad(found.sum(), trained, allow_unused=True)

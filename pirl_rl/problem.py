@@ -165,6 +165,7 @@ class ReachAvoidProblem(ABC):
 def _normalized(levels, x: Tensor) -> Tensor:
     """g/|grad g| (*, k) of each of the k levels: the signed distance to the surface g = 0, to first order."""
     value, pullback = torch.func.vjp(levels, x)  # type: ignore[misc]
-    gradients = torch.stack([pullback(one.expand_as(value))[0] for one in torch.eye(value.shape[-1]).to(value)], -2)
+    axes = torch.eye(value.shape[-1], dtype=value.dtype, device=value.device)
+    gradients = torch.stack([pullback(one.expand_as(value))[0] for one in axes], -2)
     slope = gradients.norm(dim=-1)
     return value / torch.where(slope > 0, slope, torch.ones_like(slope))

@@ -84,7 +84,8 @@ class Box:
     def contains(self, x: Tensor) -> Tensor:
         """Whether points (*, n) lie in the closed box, (*) bool; every coordinate of a periodic axis does."""
         inside = self.normalize(x).abs() <= 1
-        inside[..., list(self.periodic)] = True
+        for axis in self.periodic:
+            inside[..., axis] = True
         return inside.all(-1)
 
     def sample(

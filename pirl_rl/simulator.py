@@ -28,7 +28,7 @@ from pirl_rl.crossings import crosses_any, enters_intersection
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sigma import constant_matrix, times
-from pirl_rl.structure import noise_channels
+from pirl_rl.structure import has_controlled_noise, noise_channels
 
 Draws = tuple[Tensor, Tensor | None, Tensor | None, Tensor | None]
 """The random numbers of a sub-step: normal (w, N) for the noise, and for crossings uniform (R, N, k) for R attempts at
@@ -119,8 +119,25 @@ class Simulator:
         return noise_channels(self.problem)
 
     @cached_property
-    def constant_sigma(self) -> Tensor | None:
-        """sigma (n, w) if it depends on neither state nor control, else None."""
+    def controlled_noise(self) -> bool:
+        """Whether sigma depends on the control."""
+        return has_controlled_noise(self.problem)
+
+    def constant_sigma(self, device: torch.device) -> Tensor | None:
+        """sigma (n, w) on a device if it depends on neither state nor control, else None."""
+        if self._found_sigma is None:
+            return None
+        # A copy to a GPU takes time, and a recording of its kernels must not contain one.
+        if device not in self._sigma_on:
+            self._sigma_on[device] = self._found_sigma.to(device)
+        return self._sigma_on[device]
+
+    @cached_property
+    def _sigma_on(self) -> dict[torch.device, Tensor]:
+        return {}
+
+    @cached_property
+    def _found_sigma(self) -> Tensor | None:
         rng = torch.Generator().manual_seed(0)
         x, u = (box.sample(256, rng, torch.float64) for box in (self.problem.states, self.problem.controls))
         return constant_matrix(self.problem.diffusion, x, u)
@@ -152,7 +169,7 @@ class Simulator:
         failed, noise = reached, x
         for index in range(self.substeps):
             random = self._draw(x, rng)
-            moved, kick, now_reached, now_failed = self._advanced(x, u, h, *random, self.constant_sigma)
+            moved, kick, now_reached, now_failed = self._advanced(x, u, h, *random, self.constant_sigma(x.device))
             if index == 0:
                 x, reached, failed, noise = moved, now_reached & ~now_failed, now_failed, kick
                 continue

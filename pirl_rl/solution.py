@@ -109,7 +109,8 @@ class Solution:
             tau, x = self._own(tau, x)
             value = self._critics(tau, x)
             slope = torch.func.grad(lambda y: value(tau, y).mean(0).sum())
-            columns = [torch.func.jvp(slope, (x,), (axis.expand_as(x),))[1] for axis in torch.eye(x.shape[-1]).to(x)]
+            axes = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
+            columns = [torch.func.jvp(slope, (x,), (axis.expand_as(x),))[1] for axis in axes]
             return torch.stack(columns, -1)
 
     def _own(self, tau: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,23 +5,27 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from tensordict import TensorDict
 from torch import Tensor
+from torchrl.data import LazyTensorStorage
 
-from pirl_rl import checkpoint
+from pirl_rl import checkpoint, recording
 from pirl_rl.collectors import TransitionCollector
 from pirl_rl.curriculum import Curriculum, Stage, StageSettings
 from pirl_rl.errors import ArgumentError, DivergenceError, Interrupted
 from pirl_rl.evaluation import Evaluator, Evidence, evaluate, metrics_of, statements_of
 from pirl_rl.files import replacing
 from pirl_rl.guard import Rollback
+from pirl_rl.internals import generator_of
 from pirl_rl.learner import Learner
 from pirl_rl.loggers import MetricsLogger, NoLogger
 from pirl_rl.progress import Progress, announce, interruptible
+from pirl_rl.recording import Recordings
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.sampling.batches import BatchSampler
 from pirl_rl.sampling.boundary import BoundarySampler
@@ -133,6 +137,11 @@ class Trainer:
         self.rollback: Rollback | None = None
         if rollback:
             self.rollback = Rollback.of(learner, self.during, self.simulator, evaluate_every)
+        # A buffer that worker processes fill is in the memory of the CPU.
+        device, storage = self.solution.device, collector.buffer.storage
+        self.records = recording.records(device) and isinstance(storage, LazyTensorStorage) and storage.device == device
+        self._recordings = Recordings("an update", self.generators)
+        self._progress: float | Tensor = torch.zeros((), device=device) if self.records else 0.0
         self.update, self.saved, self.wall_seconds = 0, 0, 0.0
         self._started = self._saved_at = 0.0
 
@@ -159,9 +168,7 @@ class Trainer:
     def _loop(self, interrupted: Callable[[], bool]) -> None:
         with Progress(self.updates, self.update) as progress:
             for k in range(self.update, self.updates):
-                batch, weights, decay = self.draw(k)
-                terms = self.learner.update(batch, k, weights, decay)
-                progress.show(k + 1, self.record(k, terms))
+                progress.show(k + 1, self.record(k, self.advance(k)))
                 stop = interrupted() and self.update < self.updates
                 self.keep(stop)
                 if stop:
@@ -189,13 +196,38 @@ class Trainer:
         self.collector.start()
         self._started, self._saved_at = time.perf_counter() - self.wall_seconds, time.perf_counter()
 
-    def draw(self, k: int) -> tuple[TensorDict, Weights, float]:
-        """Collect what is due before update `k`; returns its batch, its loss weights and the decay of its rate."""
+    def advance(self, k: int) -> dict[str, Tensor]:
+        """Make update `k`, after what is due before it; returns the terms that `Learner.update` returns."""
+        weights = self.arrive(k)
+        self.learner.prepare(weights, self.curriculum.decay(k), k)
+
+        def update() -> dict[str, Tensor]:
+            return self.learner.make(self.draw(weights), k)
+
+        return self._recordings(self.kind(k, weights), update) if self.records else update()
+
+    def arrive(self, k: int) -> Weights:
+        """Collect what is due before update `k`; returns its loss weights."""
         if self.curriculum.is_first(k):
             self._enter_stage()
         self.collector.step(k)
-        weights = self.curriculum.weights(k)
-        return self.batches.sample(weights, self.curriculum.progress(k)), weights, self.curriculum.decay(k)
+        self._progress = recording.renewed(self._progress, self.curriculum.progress(k))
+        return self.curriculum.weights(k)
+
+    def draw(self, weights: Weights) -> TensorDict:
+        """The batch of the update at which training has arrived."""
+        return self.batches.sample(weights, self._progress)
+
+    def kind(self, k: int, weights: Weights) -> tuple[Hashable, ...]:
+        """What decides which kernels update `k` launches, and on which memory."""
+        acts, size = k % self.learner.actor_every == 0, len(self.collector.buffer)
+        return self.curriculum.index(k), self.batches.parts(weights), acts, size
+
+    @property
+    def generators(self) -> list[torch.Generator]:
+        """The random generators from which updates draw, beside torch's default one."""
+        own = generator_of(self.collector.buffer)
+        return [self.batches.rng, *([] if own is None else [own])]
 
     def record(self, k: int, terms: Mapping[str, Tensor]) -> dict[str, float]:
         """Count update `k`, log its row of metrics and judge it; returns the row, which may be empty.
@@ -206,6 +238,7 @@ class Trainer:
         self.update, self.wall_seconds = k + 1, time.perf_counter() - self._started
         row = self._row(k, terms)
         if row:
+            self.learner.check(self.update)
             self.logger.log(row)
         if self.rollback is not None and ("success_rate" in row or self.update == self.updates):
             self.rollback.judge(self.update, row)
@@ -280,7 +313,7 @@ class Trainer:
         Raises:
             DivergenceError: where the networks are spoilt; the checkpoint before stays.
         """
-        self.learner.check_parameters(self.update)
+        self.learner.check(self.update)
         if self.folder is None:
             return
         run = RunDirectory(self.folder)
@@ -306,6 +339,7 @@ class Trainer:
         """Continue from a state; call it before `train`."""
         self.update, self.saved, self.wall_seconds = state["update"], state["update"], state["wall_seconds"]
         self.learner.load_state_dict(state["learner"])
+        self._recordings.forget()
         self.collector.load_state_dict(state["collector"])
         if self.rollback is not None and state.get("rollback") is not None:
             self.rollback.load_state_dict(state["rollback"])

@@ -17,7 +17,7 @@ from pirl_rl.operators import masked_mean
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
-from pirl_rl.structure import has_controlled_noise, noise_channels
+from pirl_rl.structure import noise_channels
 from pirl_rl.switching import LEVELS, control_levels
 
 INERTIA = 0.1
@@ -98,7 +98,7 @@ class BestControl(ActorRule):
                 f"got {steps}, {levels}, {budget} and {inertia}"
             )
         self.simulator, self.steps, self.levels, self.inertia = simulator, steps, levels, inertia
-        self.controlled_noise, self.compiles_whole = has_controlled_noise(problem), steps == 0
+        self.controlled_noise, self.compiles_whole = simulator.controlled_noise, steps == 0
         channels, self.budget = noise_channels(problem), budget
         self.cubature = steps == 0 and self.controlled_noise and channels * problem.controls.dim <= 64
         self.simulated = steps or (channels / 2 if self.cubature else 0)
@@ -107,7 +107,10 @@ class BestControl(ActorRule):
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
         actor, choice = solution.actor, solution.actor.choice
         near = points["state"]
-        levels = choice.combinations(near) if choice else torch.linspace(-1, 1, self.levels).to(near).unsqueeze(-1)
+        if choice:
+            levels = choice.combinations(near)
+        else:
+            levels = torch.linspace(-1, 1, self.levels, dtype=near.dtype, device=near.device).unsqueeze(-1)
         most = self.most_points(solution.problem.controls.dim // levels.shape[1], len(levels))
         tau, x = points["tau"][:most], points["state"][:most]
         logits = actor.logits(tau, x)

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal
 
-from tensordict import TensorDict
+from tensordict import TensorDictBase
 
 from pirl_rl.checkpoint import restore_rng
 from pirl_rl.collectors.buffers import buffer_state, check_sizes, fill_buffer, load_buffer, make_buffer
 from pirl_rl.collectors.player import Player
 from pirl_rl.collectors.transitions import ControlVariate, Exploration, PlayedPolicy
 from pirl_rl.envs import ReachAvoidEnv
-from pirl_rl.internals import carried
 from pirl_rl.networks import Actor
 from pirl_rl.sampling.initial_states import InitialStates
 
 
 class SyncCollector:
     """Collects `frames_per_batch` transitions every `updates_per_batch` updates, in the learner's process.
+
+    Attributes:
+        source: plays a batch and returns its transitions (frames_per_batch,).
 
     Args:
         env: the environment.
@@ -60,6 +63,20 @@ class SyncCollector:
         self.buffer, self._rng = make_buffer(buffer_size, env.device, seed)
         policy = PlayedPolicy(actor, Exploration(exploration_noise, exploration), control_variate)
         self._player = Player(env, policy, frames_per_batch, warmup_frames, n_steps)
+        self.source: Callable[[], TensorDictBase] = self._player.play
+
+    @property
+    def policy(self) -> PlayedPolicy:
+        return self._player.policy
+
+    @property
+    def has_played(self) -> bool:
+        """Whether no random actions are to come, since there are steps already or the actor plays from the start."""
+        return self._player.state_dict()["frames"] > 0
+
+    @property
+    def frames_per_batch(self) -> int:
+        return self._player.frames_per_batch
 
     @property
     def initial_states(self) -> InitialStates:
@@ -82,8 +99,7 @@ class SyncCollector:
     def warm_start(self, buffer: dict[str, Any] | None) -> None:
         if buffer is not None:
             fill_buffer(self.buffer, self._rng.device, self.env, buffer)
-        # The count of frames is part of the state; after this one, TorchRL's collector plays no more random actions.
-        self._player.count(self._player.collector.init_random_frames)
+        self._player.skip_random()
 
     def start(self) -> None:
         while len(self.buffer) < min(self.warmup_frames, self.buffer.storage.max_size):
@@ -101,8 +117,7 @@ class SyncCollector:
         return {
             "buffer": buffer_state(self.buffer, self._rng),
             "exploration_noise": self.exploration_noise,
-            "frames": self._player.collector.state_dict()["frames"],
-            "carrier": carried(self._player.collector).to_dict(),
+            **self._player.state_dict(),
             "env_rng": self.env.rng.get_state(),
             "supply": self.env.supply.state_dict(),
         }
@@ -110,11 +125,9 @@ class SyncCollector:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         load_buffer(self.buffer, self._rng, state["buffer"])
         self._player.policy.exploration.deviation = state["exploration_noise"]
-        # TorchRL does not save the state of environments; that of a ReachAvoidEnv is the carried TensorDict.
-        self._player.count(state["frames"])
-        carried(self._player.collector).update(TensorDict(state["carrier"], device=self.env.device))
+        self._player.load_state_dict({name: state[name] for name in ("frames", "carrier")})
         restore_rng(self.env.rng, state["env_rng"])
         self.env.supply.load_state_dict(state["supply"])
 
     def _collect(self) -> None:
-        self.buffer.extend(self._player.play())
+        self.buffer.extend(self.source())

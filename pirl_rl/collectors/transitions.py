@@ -88,7 +88,7 @@ class ControlVariate(nn.Module):
     def forward(self, tau: Tensor, state: Tensor, action: Tensor, constant: Tensor | None) -> Tensor:
         """The slope (N, n) of V, per unit of the state, at tau (N, 1) and state (N, n), at a frozen action (N, m).
 
-        Compiled code cannot find `constant`, which is `simulator.constant_sigma`, and is given it.
+        Compiled code cannot find `constant`, which is `simulator.constant_sigma(tau.device)`, and is given it.
         """
         value, controls = self.critic.at(action), self.simulator.problem.controls
 
@@ -98,7 +98,7 @@ class ControlVariate(nn.Module):
 
         slope, v = torch.func.grad(summed, has_aux=True)(state)
         sigma = self.simulator.sigma(state, controls.denormalize(action), constant)
-        deviation = transposed_times(sigma, slope).norm(dim=-1) * self.simulator.dt**0.5
+        deviation = transposed_times(sigma, slope).square().sum(-1).sqrt() * self.simulator.dt**0.5
         bound = (2 * self.limit * (v * (1 - v)).clamp(min=0).sqrt()).clamp(min=LEAST_DEVIATION)
         return slope * (bound / torch.maximum(deviation, bound)).unsqueeze(-1)
 
@@ -125,7 +125,7 @@ class PlayedPolicy(TensorDictModuleBase):
             if self.control_variate.compiles and self._compiled is None:
                 # Not before the first call, because copies of this module are sent to other processes.
                 self._compiled = Compiled(self._with_slope, "the policy with its control variate")
-            constant = self.control_variate.simulator.constant_sigma
+            constant = self.control_variate.simulator.constant_sigma(state.device)  # type: ignore[arg-type]
             loc, slope = (self._compiled or self._with_slope)(tau, state, constant)
             tensordict.set("slope", slope)
         action = self.exploration(loc, tensordict["is_init"])

@@ -17,6 +17,7 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from pirl_rl import checkpoint
+from pirl_rl.assembly import choose
 from pirl_rl.building import convert
 from pirl_rl.commands.directory import begin, new_directory, reopen, show
 from pirl_rl.configuration import load_config, save_config
@@ -59,6 +60,7 @@ def train_population(
     if config.grid is not None:
         raise ConfigError(f"{SEEDS}: expected null with method=grid, which draws no random numbers")
     settings = _members(config)
+    choose(config, problem)  # once for all members
     trainers, numbers, configs = [], [], []
     with contextlib.ExitStack() as stack:
         for name, own in zip(member_names(config), settings, strict=True):

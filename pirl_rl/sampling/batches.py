@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDict
+from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
 from pirl_rl.sampling.boundary import BoundarySampler
@@ -41,14 +42,18 @@ class BatchSampler:
         self.size, self.largest, self.device = size, largest, device
         self.rng = torch.Generator(device).manual_seed(seed)
 
-    def sample(self, weights: Weights, progress: float) -> TensorDict:
+    def parts(self, weights: Weights) -> tuple[bool, ...]:
+        """Whether the TD, the HJB and the boundary term count with the weights (w_TD, w_HJB, w_BC)."""
+        return tuple(w > NEGLIGIBLE * most for w, most in zip(weights, self.largest, strict=True))
+
+    def sample(self, weights: Weights, progress: float | Tensor) -> TensorDict:
         """{"replay", "collocation", "boundary"}; without the TD term, "replay" has no "next".
 
         Args:
             weights: (w_TD, w_HJB, w_BC) of the update.
-            progress: how far the schedule of the weights has come, in [0, 1].
+            progress: how far the schedule of the weights has come, in [0, 1]; a scalar.
         """
-        td, hjb, boundary = (w > NEGLIGIBLE * most for w, most in zip(weights, self.largest, strict=True))
+        td, hjb, boundary = self.parts(weights)
         replay = self.buffer.sample(self.size)
         parts = {"replay": replay if td else replay.exclude("next")}
         if hjb:

@@ -10,15 +10,17 @@ face whose layer s^2 / (2 v) is thinner than a network resolves would pull V dow
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, partial
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from pirl_rl import recording
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.sampling.faces import find_faces
+from pirl_rl.sampling.faces import FACE_POOL, find_faces
 from pirl_rl.sampling.initial_states import sample_interior
 
 RESOLVED = 0.05
@@ -79,6 +81,31 @@ class BoundarySampler:
         parts = zip(points.split(AT_ONCE), values.split(AT_ONCE), strict=True)
         return torch.cat([face_weights(self.problem, *part) for part in parts])
 
+    @cached_property
+    def _kept(self) -> dict[tuple[str, torch.device], Any]:
+        """What stays on a device, since each copy to it takes time."""
+        return {}
+
+    def _faces_on(self, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+        """The points of the pool (K, n), with their values and weights (K,), on a device."""
+        if ("faces", device) not in self._kept:
+            entries = self._pool.points, self._pool.values, self._weights
+            self._kept["faces", device] = tuple(entry.to(device) for entry in entries)
+        return self._kept["faces", device]
+
+    def _interior(self, rng: torch.Generator) -> Tensor:
+        """States (initial, n), uniform in the part of the box outside A and B.
+
+        On a GPU they come from a pool that is drawn once: to draw again what lies in A or B asks the device for it.
+        """
+        draw = partial(sample_interior, self.problem, self.box, rng=rng, dtype=torch.get_default_dtype())
+        if not recording.records(rng.device):
+            return draw(self.initial)
+        if ("interior", rng.device) not in self._kept:
+            self._kept["interior", rng.device] = draw(FACE_POOL)
+        pool = self._kept["interior", rng.device]
+        return pool[torch.randint(len(pool), (self.initial,), generator=rng, device=rng.device)]
+
     def sample(self, rng: torch.Generator, replay: TensorDictBase | None = None) -> TensorDict:
         """Draw N = initial + faces points.
 
@@ -89,8 +116,8 @@ class BoundarySampler:
         Returns:
             A TensorDict with "tau" (N, 1), in s, "state" (N, n), "value" (N,) and "weight" (N,).
         """
-        device, dtype = rng.device, torch.get_default_dtype()
-        state = sample_interior(self.problem, self.box, self.initial, rng, dtype)
+        device = rng.device
+        state = self._interior(rng)
         visited = 0 if replay is None else round(self.replay_share * self.initial)
         if replay is not None and visited:
             index = torch.randint(len(replay), (visited,), generator=rng, device=device)
@@ -98,8 +125,7 @@ class BoundarySampler:
         value, tau = self.problem.boundary_value(state), torch.zeros(self.initial, 1, device=device)
         weight = torch.ones_like(value)
         if self.faces:
-            pool = (self._pool.points, self._pool.values, self._weights)
-            points, values, weights = (entry.to(device) for entry in pool)
+            points, values, weights = self._faces_on(device)
             index = torch.randint(len(points), (self.faces,), generator=rng, device=device)
             late = 1 - torch.rand(self.faces, 1, generator=rng, device=device)
             tau = torch.cat([tau, self.problem.horizon * late**self.tau_power])

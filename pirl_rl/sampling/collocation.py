@@ -48,13 +48,15 @@ class Collocation:
         self.problem, self.size, self.sampler, self.tau_power = problem, size, sampler, tau_power
         self.box = problem.states.expand(widen)
 
-    def sample(self, rng: torch.Generator, replay: TensorDictBase | None = None, progress: float = 0.0) -> TensorDict:
+    def sample(
+        self, rng: torch.Generator, replay: TensorDictBase | None = None, progress: float | Tensor = 0.0
+    ) -> TensorDict:
         """Draw points.
 
         Args:
             rng: the random generator, on whose device the points are.
             replay: the transitions of the update, with "tau" and "state", for samplers that stay near visited states.
-            progress: the progress of the loss schedule in [0, 1], for samplers that change with it.
+            progress: the progress of the loss schedule in [0, 1], a scalar, for samplers that change with it.
 
         Returns:
             A TensorDict with "tau" (size, 1), in s, "state" (size, n) and "mask" (size,), see `mask`.
@@ -112,7 +114,9 @@ class ReplayCollocation(Collocation):
                 raise ArgumentError(f"collocation.{name}: expected [start, end] from 0 to {most:g}, got {list(ends)}")
         self.replay_share, self.jitter = tuple(replay_share), tuple(jitter)
 
-    def sample(self, rng: torch.Generator, replay: TensorDictBase | None = None, progress: float = 0.0) -> TensorDict:
+    def sample(
+        self, rng: torch.Generator, replay: TensorDictBase | None = None, progress: float | Tensor = 0.0
+    ) -> TensorDict:
         rest = super().sample(rng, replay, progress)
         if replay is None:
             return rest

@@ -1,4 +1,4 @@
-"""A supply of initial states, which are drawn many at a time."""
+"""Supplies of initial states, which are drawn many at a time."""
 
 from __future__ import annotations
 
@@ -44,3 +44,50 @@ class Supply:
         """Continue with the initial states that were left."""
         if state:
             self._steps, self._states = state["steps"], state["states"]
+
+
+class Stock:
+    """Queues of initial states on a device, which are filled before the steps in which their states are taken.
+
+    The host does not know how many states are taken. If more are taken than a queue has, it begins anew. The memory of
+    the queues stays where it is, so that a recording of kernels can read it.
+
+    Args:
+        groups: the number of queues, each for an equal number of paths in a row.
+    """
+
+    SHARE = 4
+    """A queue has a state for this part of the steps of its paths; most steps end no episode."""
+
+    def __init__(self, groups: int = 1):
+        self.groups, self._left = groups, 0
+        self._steps, self._states = torch.empty(groups, 0, dtype=torch.int64), torch.empty(groups, 0, 0)
+        self._taken = torch.zeros(groups, 1, dtype=torch.int64)
+
+    def fill(self, steps: int, paths: int, draw: Draw) -> None:
+        """Fill the queues for the next steps of all paths."""
+        size = paths // self.groups * -(-steps // self.SHARE)
+        counts, states = draw(self.groups * size)
+        counts, states = counts.reshape(self.groups, size), states.reshape(self.groups, size, -1)
+        if self._states.shape == states.shape:
+            self._steps.copy_(counts)
+            self._states.copy_(states)
+            self._taken.zero_()
+        else:
+            self._steps, self._states = counts.contiguous(), states.contiguous()
+            self._taken = torch.zeros(self.groups, 1, dtype=torch.int64, device=states.device)
+        self._left = steps
+
+    def take(self, ended: Tensor, draw: Draw) -> tuple[Tensor, Tensor]:
+        """Control steps to go (N,) and states (N, n), of which paths that have ended, (N,) bool, take theirs.
+
+        `draw` gives new states after the last step for which the queues were filled.
+        """
+        if self._left == 0:
+            self.fill(1, len(ended), draw)
+        self._left -= 1
+        counted = ended.reshape(self.groups, -1).long().cumsum(-1)
+        place = (self._taken + counted - 1) % self._steps.shape[1]
+        self._taken += counted[:, -1:]
+        states = self._states.gather(1, place.unsqueeze(-1).expand(-1, -1, self._states.shape[-1]))
+        return self._steps.gather(1, place).flatten(), states.flatten(0, 1)
