@@ -278,7 +278,7 @@ def memory(case: Case, probes: int) -> dict[str, float]:
         return entry
 
     with torch.autograd.graph.saved_tensors_hooks(pack, lambda entry: entry):
-        loss = term.hjb_loss(term.batch)
+        loss, _ = term.hjb_loss(term.batch)
         kept = sum(held.values())
         loss.backward()
     dense = [layer for layer in term.critic.layers if isinstance(layer, Dense)]

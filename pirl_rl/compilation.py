@@ -59,6 +59,45 @@ class Compiled:
             return self.function(*args)
 
 
+def rowwise(function: Callable[..., torch.Tensor], name: str) -> Callable[..., torch.Tensor]:
+    """The function, compiled also where `torch.func.vmap` maps it; where gradients are taken, it runs eagerly.
+
+    A compiled function cannot be mapped. This one gets the rows of all members at once.
+
+    Args:
+        function: maps tensors (N, ...) to a tensor (N, ...), each row by itself.
+        name: of the function, for the warning of `Compiled`.
+    """
+    compiled_function = Compiled(function, name)
+
+    def called(*rows: torch.Tensor) -> torch.Tensor:
+        return function(*rows) if torch.is_grad_enabled() else _Rowwise.apply(compiled_function, *rows)  # type: ignore
+
+    return called
+
+
+class _Rowwise(torch.autograd.Function):
+    """A function of rows without gradients, which is mapped by making one axis of the members and the rows."""
+
+    @staticmethod
+    def forward(function: Callable[..., torch.Tensor], *rows: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
+        return function(*rows)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        pass
+
+    @staticmethod
+    def vmap(info: Any, in_dims: Any, function: Callable[..., torch.Tensor], *rows: torch.Tensor) -> Any:
+        members = info.batch_size
+        moved = [
+            row.expand(members, *row.shape) if axis is None else row.movedim(axis, 0)
+            for row, axis in zip(rows, in_dims[1:], strict=True)
+        ]
+        result = _Rowwise.apply(function, *(row.flatten(0, 1) for row in moved))
+        return result.unflatten(0, (members, -1)), 0  # type: ignore[union-attr]
+
+
 def is_compiler_failure(error: Exception) -> bool:
     """Whether an error comes from the compiler, as without a C++ compiler, and not from the compiled function."""
     # The compiler takes a second to import, which commands that compile nothing need not spend.

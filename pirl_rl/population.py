@@ -22,7 +22,7 @@ from torch import Tensor
 from pirl_rl import checkpoint
 from pirl_rl.collectors import SyncCollector
 from pirl_rl.collectors.joint import JointPlayer
-from pirl_rl.compilation import Compiled
+from pirl_rl.compilation import Compiled, rowwise
 from pirl_rl.errors import ArgumentError, DivergenceError, Interrupted
 from pirl_rl.gradients import Gradient, Terms
 from pirl_rl.losses import TERMS, PIRLLoss
@@ -281,8 +281,7 @@ class StackedLosses:
     def _program(self, which: Trained, loss: PIRLLoss) -> Program:
         function, params = loss.critic_loss, loss.qvalue_network_params
         if which == "actor":
-            # What a rule compiles by itself could not be mapped over the members.
-            loss.actor_rule.compile(lambda inner: inner)
+            loss.actor_rule.compile(self._mapped)
             function, params = loss.actor_loss, loss.actor_network_params
         keys = [tuple(name.split(".")) for name, _ in params.named_parameters()]
         # The networks of TorchRL's losses are modules without parameters, to which any can be lent.
@@ -310,6 +309,10 @@ class StackedLosses:
 
         whole = which == "critic" or loss.actor_rule.compiles_whole
         return Compiled(program, f"the loss of the {which}s") if self.compile and whole else program
+
+    def _mapped(self, inner: Callable[..., Tensor]) -> Callable[..., Tensor]:
+        """An inner function of an actor rule, in a form that can be mapped over the members."""
+        return rowwise(inner, "an inner function of the actor's loss") if self.compile else inner
 
 
 def _completed(batches: Sequence[TensorDictBase]) -> list[TensorDictBase]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import __main__ as command
-from benchmarks import ratios, time_to_accuracy
+from benchmarks import dimension, ratios, time_to_accuracy
 from benchmarks.ratios import WORSE, compare, table
 from pirl_rl.layers import Dense
 
@@ -124,6 +124,13 @@ def test_benchmarks_that_cannot_run_are_left_out_with_a_sentence(folder, monkeyp
 
 def row(update: int, mse: float, seconds: float) -> dict[str, float]:
     return {"update": update, "mse": mse, "seconds": seconds, "processor": seconds / 2}
+
+
+@pytest.mark.parametrize("probes", [0, 4])
+def test_the_memory_of_a_term_is_below_the_bound_that_the_documentation_states(probes):
+    """And above half of it: the bound should say how much is needed."""
+    found = dimension.memory(dimension.Case(points=64, channels=6, states=6), probes)
+    assert 0.5 * found["bound"] < found["held"] <= found["bound"]
 
 
 def test_a_bound_is_reached_at_the_first_update_below_it():

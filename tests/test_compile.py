@@ -17,7 +17,7 @@ from pirl_rl import learner
 from pirl_rl.actor_rules import BestControl, ClippedSurrogate, LookAhead
 from pirl_rl.assembly import make_trainer
 from pirl_rl.commands.composition import compose
-from pirl_rl.compilation import compiled
+from pirl_rl.compilation import compiled, rowwise
 from pirl_rl.evaluation import statements_of
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.simulator import Simulator
@@ -184,3 +184,27 @@ def test_all_evaluators_play_a_shared_simulator():
     paths = [f"evaluation.{number}=2" for number in numbers]
     trainer = make_trainer(compose("train", ["+experiment=reach1d", "device=cpu", "logger=none", *paths]))
     assert {"success_rate", "calibration_mse", "verdict"} <= {*trainer.finish(), *statements_of(trainer.evidence)}
+
+
+@needs_compiler
+def test_a_function_of_rows_is_compiled_where_it_is_mapped():
+    eager: list[tuple[int, ...]] = []
+
+    def function(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        if not torch.compiler.is_compiling():
+            eager.append(tuple(x.shape))
+        return x.sin() * y.unsqueeze(-1)
+
+    x, y = torch.randn(3, 5, 2), torch.randn(3, 5)
+    mapped = rowwise(function, "the function")
+    with torch.no_grad():
+        all_own = torch.func.vmap(mapped)(x, y)
+        last_axis = torch.func.vmap(mapped, in_dims=(2, None))(x.movedim(0, 2), y[0])
+    assert eager == []
+    torch.testing.assert_close(all_own, function(x, y))
+    torch.testing.assert_close(last_axis, function(x, y[0]))
+    eager.clear()
+    x.requires_grad_()
+    mapped(x[0], y[0]).sum().backward()  # gradients need the function itself
+    assert eager == [(5, 2)]
+    torch.testing.assert_close(x.grad[0], x[0].detach().cos() * y[0].unsqueeze(-1))
