@@ -57,11 +57,12 @@ def train(
     torch.set_num_threads(threads)
     trainers, numbers = [], []
     config = compose("train", [*PLAIN, *settings])
-    choose(config, make_problem(config))
+    problem = make_problem(config)
+    choose(config, problem)
     for seed in range(members):
         own = copy.deepcopy(config)
         own.seed = seed
-        trainers.append(make_trainer(own))
+        trainers.append(make_trainer(own, problem=problem))
         numbers.append(checkpoint.global_rng_states())
     step, last = trainers[0].collector.step, warm_up + updates
 

@@ -70,6 +70,7 @@ class Population:
         if len(kinds) != 1:
             raise ArgumentError("population: expected members with the same updates and networks of the same shapes")
         self.members, self._numbers = members, list(numbers)
+        _share_simulator(members)
         self.errors: dict[int, DivergenceError] = {}
         self._losses = StackedLosses(members[0].learner.gradients.compile)
         self._records = all(member.records for member in members)
@@ -313,6 +314,17 @@ class StackedLosses:
     def _mapped(self, inner: Callable[..., Tensor]) -> Callable[..., Tensor]:
         """An inner function of an actor rule, in a form that can be mapped over the members."""
         return rowwise(inner, "an inner function of the actor's loss") if self.compile else inner
+
+
+def _share_simulator(members: Sequence[Trainer]) -> None:
+    """Let all members play the simulator of the first where theirs are equal, so that it is compiled once."""
+    playing = [(member, member.collector.env) for member in members if isinstance(member.collector, SyncCollector)]
+    for member, env in playing:
+        first = playing[0][1].simulator
+        if env.simulator == first:
+            env.simulator = first
+            if member.simulator.shared is not None:
+                member.simulator.share(first)
 
 
 def _completed(batches: Sequence[TensorDictBase]) -> list[TensorDictBase]:
