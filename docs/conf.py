@@ -58,6 +58,7 @@ reference_rooms = {
             "pirl_rl.structure",
             "pirl_rl.sets",
             "pirl_rl.payoffs",
+            "pirl_rl.constants",
             "pirl_rl.problems.cartpole",
             "pirl_rl.problems.double_integrator",
             "pirl_rl.problems.dubins",

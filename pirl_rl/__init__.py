@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pirl_rl import problems as problems
     from pirl_rl.api import check, evaluate, load_run, monte_carlo, train
+    from pirl_rl.constants import constant
     from pirl_rl.filters import ReachAvoidFilter
     from pirl_rl.losses import PIRLLoss
     from pirl_rl.operators import generator
@@ -31,6 +32,7 @@ __all__ = [
     "band",
     "check",
     "complement",
+    "constant",
     "difference",
     "evaluate",
     "generator",
@@ -46,6 +48,7 @@ _MODULE_OF = {
     **dict.fromkeys(("load_run", "monte_carlo"), "pirl_rl.api"),
     **dict.fromkeys(("Box", "Plane", "band", "complement", "difference", "intersection", "union"), "pirl_rl.sets"),
     "PIRLLoss": "pirl_rl.losses",
+    "constant": "pirl_rl.constants",
     "generator": "pirl_rl.operators",
     "ReachAvoidFilter": "pirl_rl.filters",
     "ReachAvoidProblem": "pirl_rl.problem",

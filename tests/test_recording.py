@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import pytest
 import torch
-from small import DRIFT, EVENTS, PHYSICS, QUICK, at_update, resumed, small_trainer
+from small import DRIFT, EVENTS, PHYSICS, QUICK, STEPS, at_update, resumed, small_trainer
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from pirl_rl import recording
 from pirl_rl.collectors.joint import JointPlayer
+from pirl_rl.constants import constant
 from pirl_rl.errors import DivergenceError
 from pirl_rl.population import Population
 from pirl_rl.recording import Recorded
@@ -29,6 +30,11 @@ def tensors(tree) -> list[torch.Tensor]:
     return [leaf for leaf in tree_leaves(tree) if isinstance(leaf, torch.Tensor)]
 
 
+def memory(entry: torch.Tensor) -> int | None:
+    """Where the entries of a tensor are; the zeros of forward mode are nowhere."""
+    return None if entry._is_zerotensor() else entry.untyped_storage().data_ptr()
+
+
 class Tape(TorchDispatchMode):
     def __init__(self, name: str):
         super().__init__()
@@ -41,8 +47,8 @@ class Tape(TorchDispatchMode):
         if func in REFUSED or by_mask:
             raise RuntimeError(f"{func} asks something of the device")
         result = func(*args, **(kwargs or {}))
-        memory = {entry.untyped_storage().data_ptr() for entry in tensors((args, kwargs))}
-        new = [entry.untyped_storage().data_ptr() not in memory for entry in tensors(result)]
+        known = {memory(entry) for entry in tensors((args, kwargs))}
+        new = [memory(entry) not in {*known, None} for entry in tensors(result)]
         self.operations.append((func, args, kwargs or {}, tensors(result), new))
         return result
 
@@ -81,18 +87,47 @@ BASES = {"default": QUICK + EVENTS, "physics": QUICK + EVENTS + PHYSICS, "drift"
 BASES["muon"] = (*QUICK, *EVENTS, "learner.optimizer=muon", "learner.target_warmup=3", "actor.hidden=[16,16,16]")
 
 
-@pytest.mark.parametrize("members", [1, 3])
-@pytest.mark.parametrize("base", BASES.values(), ids=BASES)
-def test_replays_do_what_the_work_does(as_on_a_gpu, monkeypatch, base, members, tmp_path):
+def assert_replays_do_what_the_work_does(monkeypatch, folder, updates: int, members: int, base) -> None:
     found = []
     for how in (direct, emulated):
         monkeypatch.setattr(Recorded, "_record", how)
-        changes = ("compile=false", "trainer.updates=12")
-        folder = tmp_path / how.__name__
-        trainers = [small_trainer(folder / str(i), *changes, f"seed={i}", base=base) for i in range(members)]
+        changes, own = ("compile=false", f"trainer.updates={updates}"), folder / how.__name__
+        trainers = [small_trainer(own / str(seed), *changes, f"seed={seed}", base=base) for seed in range(members)]
         trainers[0].train() if members == 1 else Population(trainers, [{} for _ in trainers]).train()
         found.append(networks(*trainers))
     torch.testing.assert_close(*found, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("members", [1, 3])
+@pytest.mark.parametrize("base", BASES.values(), ids=BASES)
+def test_replays_do_what_the_work_does(as_on_a_gpu, monkeypatch, base, members, tmp_path):
+    assert_replays_do_what_the_work_does(monkeypatch, tmp_path, 12, members, base)
+
+
+SHIPPED = ("dubins", "zermelo", "pendulum", "cartpole", "quadrotor", "halfspace", "radial_exit", "drift3")
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_the_shipped_problems_can_be_recorded(as_on_a_gpu, monkeypatch, name, tmp_path):
+    """With all terms of the loss, so that drift, diffusion and levels are computed."""
+    small = ("env.num_envs=16", "collector.frames_per_batch=32", "collector.warmup_frames=32")
+    small += (
+        "collector.buffer_size=32",
+        "collector.updates_per_batch=2",
+        "collector.n_steps=1",
+        "trainer.batch_size=8",
+    )
+    terms = ("pirl.final=[1,1,10]", "loss.hjb_probes=0", "evaluation.final=[]", "evaluation.during=[]")
+    base = (
+        f"+experiment={name}",
+        "+debug=default",
+        *STEPS,
+        *small,
+        *terms,
+        "trainer.evaluate_every=0",
+        "figures=false",
+    )
+    assert_replays_do_what_the_work_does(monkeypatch, tmp_path, 5, 1, base)
 
 
 def test_most_updates_are_replayed(as_on_a_gpu, monkeypatch, tmp_path):
@@ -171,3 +206,15 @@ def test_a_stock_is_drawn_again_after_its_steps():
     for _ in range(6):
         stock.take(torch.ones(5, dtype=torch.bool), draw)
     assert draws == [5, 5, 5]
+
+
+def test_numbers_become_a_tensor_once_for_each_dtype():
+    x, y = torch.zeros(3), torch.zeros(3, dtype=torch.float64)
+    assert constant((0.1, 2), x) is constant([0.1, 2.0], x)
+    assert constant((0.1, 2), y).dtype == torch.float64
+    torch.testing.assert_close(constant([[0.1, 2.0], [3.0, 4.0]], y), torch.tensor([[0.1, 2], [3, 4]]).to(y))
+    mapped = torch.func.vmap(torch.func.functionalize(lambda z: z * constant((0.5, 0.9), z)))(torch.ones(2, 2))
+    torch.testing.assert_close(mapped, torch.tensor([[0.5, 0.9], [0.5, 0.9]]))
+    torch.testing.assert_close(constant((0.5, 0.9), x).clone(), torch.tensor([0.5, 0.9]))
+    compiled = torch.compile(lambda z: z * constant((0.3, 0.7), z), backend="eager", fullgraph=True)
+    torch.testing.assert_close(compiled(torch.ones(2)), torch.tensor([0.3, 0.7]))

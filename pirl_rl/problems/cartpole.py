@@ -13,6 +13,7 @@ import math
 import torch
 from torch import Tensor
 
+from pirl_rl.constants import constant
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems.noise import independent_noise
 from pirl_rl.sets import Box, Plane
@@ -50,7 +51,7 @@ class CartPole(ReachAvoidProblem):
         return independent_noise(x, self.noise)
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
-        return x.new_tensor(self.limits) - x[..., ::2].abs()
+        return constant(self.limits, x) - x[..., ::2].abs()
 
     @property
     def planes(self) -> dict[str, Plane]:

@@ -11,6 +11,7 @@ import math
 import torch
 from torch import Tensor
 
+from pirl_rl.constants import constant
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems.noise import independent_noise
 from pirl_rl.sets import Box, Plane
@@ -38,10 +39,10 @@ class DubinsCar(ReachAvoidProblem):
         return independent_noise(x, self.noise)
 
     def target_level(self, x: Tensor) -> Tensor:
-        return (x[..., :2] - x.new_tensor(self.target)).norm(dim=-1) - self.target_radius
+        return (x[..., :2] - constant(self.target, x)).norm(dim=-1) - self.target_radius
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
-        rock = (x[..., :2] - x.new_tensor(self.rock)).norm(dim=-1, keepdim=True) - self.rock_radius
+        rock = (x[..., :2] - constant(self.rock, x)).norm(dim=-1, keepdim=True) - self.rock_radius
         return torch.cat([rock, self.wall - x[..., :2].abs()], -1)
 
     @property

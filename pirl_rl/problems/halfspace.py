@@ -11,6 +11,7 @@ import math
 import torch
 from torch import Tensor
 
+from pirl_rl.constants import constant
 from pirl_rl.crossings import first_passage
 from pirl_rl.errors import ArgumentError
 from pirl_rl.payoffs import Payoff
@@ -57,14 +58,14 @@ class HalfSpace(ReachAvoidProblem):
         return torch.eye(x.shape[-1], dtype=x.dtype, device=x.device).expand(*x.shape, x.shape[-1])
 
     def target_level(self, x: Tensor) -> Tensor:
-        return self.offset - (x * x.new_tensor(self.normal)).sum(-1)
+        return self.offset - (x * constant(self.normal, x)).sum(-1)
 
     def exact_value(self, tau: Tensor, x: Tensor) -> Tensor:
         """The probability (*) that Brownian motion with drift `speed` covers the distance to the half-space in tau."""
         return first_passage(tau, self.target_level(x), self.speed)
 
     def optimal_control(self, tau: Tensor, x: Tensor) -> Tensor:
-        return (x.new_tensor(self.normal).sign() / math.sqrt(x.shape[-1])).expand_as(x)
+        return (constant(self.normal, x).sign() / math.sqrt(x.shape[-1])).expand_as(x)
 
     @property
     def planes(self) -> dict[str, Plane]:

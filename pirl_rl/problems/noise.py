@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
+from pirl_rl.constants import constant
+
 
 def independent_noise(x: Tensor, strengths: Sequence[float]) -> Tensor:
     """sigma (*, n, w) at states (*, n): each coordinate whose strength is not 0 has a noise channel of its own.
@@ -15,7 +17,6 @@ def independent_noise(x: Tensor, strengths: Sequence[float]) -> Tensor:
         strengths: n numbers, in units of the coordinate per sqrt(s).
     """
     channels = [axis for axis, strength in enumerate(strengths) if strength]
-    columns = x.new_zeros(len(strengths), len(channels))
-    for channel, axis in enumerate(channels):
-        columns[axis, channel] = strengths[axis]
+    rows = [[strength * (axis == channel) for channel in channels] for axis, strength in enumerate(strengths)]
+    columns = constant(rows, x)
     return columns.expand(*x.shape[:-1], *columns.shape)

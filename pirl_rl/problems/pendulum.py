@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from pirl_rl.constants import constant
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems.noise import independent_noise
 from pirl_rl.sets import Box, Plane
@@ -41,7 +42,7 @@ class Pendulum(ReachAvoidProblem):
         return independent_noise(x, self.noise)
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
-        return x.new_tensor(self.limits) - x.abs()
+        return constant(self.limits, x) - x.abs()
 
     @property
     def planes(self) -> dict[str, Plane]:

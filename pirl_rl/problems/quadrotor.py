@@ -10,6 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from pirl_rl.constants import constant
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems.noise import independent_noise
 from pirl_rl.sets import Box, Plane
@@ -48,10 +49,10 @@ class PlanarQuadrotor(ReachAvoidProblem):
         return independent_noise(x, self.noise)
 
     def target_constraints(self, x: Tensor) -> Tensor:
-        return (x - x.new_tensor(self.hover)).abs() - x.new_tensor(self.tolerances)
+        return (x - constant(self.hover, x)).abs() - constant(self.tolerances, x)
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
-        return x.new_tensor(self.limits) - (x - x.new_tensor(self.hover))[..., :3].abs()
+        return constant(self.limits, x) - (x - constant(self.hover, x))[..., :3].abs()
 
     @property
     def planes(self) -> dict[str, Plane]:

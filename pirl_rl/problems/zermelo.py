@@ -10,6 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from pirl_rl.constants import constant
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems.noise import independent_noise
 from pirl_rl.sets import Box, Plane
@@ -40,11 +41,11 @@ class ZermeloBoat(ReachAvoidProblem):
         return independent_noise(x, self.noise)
 
     def target_level(self, x: Tensor) -> Tensor:
-        return (x - x.new_tensor(self.landing)).norm(dim=-1) - self.landing_radius
+        return (x - constant(self.landing, x)).norm(dim=-1) - self.landing_radius
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
-        rock = (x - x.new_tensor(self.rock)).norm(dim=-1, keepdim=True) - self.rock_radius
-        return torch.cat([rock, x.new_tensor(self.limits) - x.abs()], -1)
+        rock = (x - constant(self.rock, x)).norm(dim=-1, keepdim=True) - self.rock_radius
+        return torch.cat([rock, constant(self.limits, x) - x.abs()], -1)
 
     @property
     def planes(self) -> dict[str, Plane]:

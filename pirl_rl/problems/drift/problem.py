@@ -13,6 +13,7 @@ import math
 import torch
 from torch import Tensor
 
+from pirl_rl.constants import constant
 from pirl_rl.payoffs import Payoff
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems.drift import vehicle
@@ -70,7 +71,7 @@ class VehicleDrift(ReachAvoidProblem):
 
     def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
         columns = torch.zeros(7, 6, dtype=x.dtype, device=x.device)
-        columns.diagonal().copy_(torch.tensor(self.noise, dtype=x.dtype, device=x.device))
+        columns.diagonal().copy_(constant(self.noise, x))
         return columns.expand(*x.shape, 6)
 
     # Coordinates and constraints are the first axis of what is computed, so that each stays contiguous in memory, and

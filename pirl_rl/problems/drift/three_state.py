@@ -13,6 +13,7 @@ import torch
 from scipy.optimize import root
 from torch import Tensor
 
+from pirl_rl.constants import constant
 from pirl_rl.payoffs import Payoff
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems.drift import vehicle
@@ -73,11 +74,11 @@ class VehicleDrift3(ReachAvoidProblem):
         return torch.stack(rates).movedim(0, -1)
 
     def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
-        columns = torch.tensor(self.noise, dtype=x.dtype, device=x.device).diag()
+        columns = constant(self.noise, x).diag()
         return columns.expand(*x.shape, 3)
 
     def target_constraints(self, x: Tensor) -> Tensor:
-        return (x - x.new_tensor(self._middle)).abs() - x.new_tensor([*self.tolerances.values()])
+        return (x - constant(self._middle, x)).abs() - constant([*self.tolerances.values()], x)
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
         beta, r, v_x = x.unbind(-1)
