@@ -34,7 +34,7 @@ def constant(values: Sequence[float] | Sequence[Sequence[float]], like: Tensor) 
         return torch.tensor(rows, dtype=like.dtype, device=like.device)
     if len(_MADE) >= MOST:
         _MADE.clear()
-    # Made within a transformation, as of `torch.func`, or within a trace, the tensor would belong to that.
-    with torch._C._DisableFuncTorch(), _disable_current_modes():
+    # Made within a transformation of `torch.func`, a trace or inference mode, the tensor would be of no use elsewhere.
+    with torch._C._DisableFuncTorch(), _disable_current_modes(), torch.inference_mode(False):
         _MADE[key] = torch.tensor(rows, dtype=like.dtype, device=like.device)
     return _MADE[key]

@@ -216,5 +216,8 @@ def test_numbers_become_a_tensor_once_for_each_dtype():
     mapped = torch.func.vmap(torch.func.functionalize(lambda z: z * constant((0.5, 0.9), z)))(torch.ones(2, 2))
     torch.testing.assert_close(mapped, torch.tensor([[0.5, 0.9], [0.5, 0.9]]))
     torch.testing.assert_close(constant((0.5, 0.9), x).clone(), torch.tensor([0.5, 0.9]))
+    with torch.inference_mode():
+        constant((0.2, 0.4), x)
+    (torch.ones(2, requires_grad=True) * constant((0.2, 0.4), x)).sum().backward()
     compiled = torch.compile(lambda z: z * constant((0.3, 0.7), z), backend="eager", fullgraph=True)
     torch.testing.assert_close(compiled(torch.ones(2)), torch.tensor([0.3, 0.7]))
