@@ -60,7 +60,10 @@ class Muon(torch.optim.Optimizer):
 
     def momentum(self, weight: Tensor) -> Tensor:
         """The running mean of the gradients of a weight, which may be changed in place."""
-        return self.state[weight].setdefault("momentum", torch.zeros_like(weight))
+        state = self.state[weight]
+        if "momentum" not in state:
+            state["momentum"] = torch.zeros_like(weight)
+        return state["momentum"]
 
 
 @torch.no_grad()
