@@ -195,7 +195,7 @@ class ReachAvoidEnv(EnvBase):
         step = self.simulator.step(x, u, self.rng, dt=clock.length(steps, shortfall).squeeze(-1).to(x))
         terminated = (step.reached | step.failed).unsqueeze(-1) | (steps <= 1)
         reward, ends = torch.zeros_like(x[..., :1]), terminated.squeeze(-1)
-        if self.stocked:  # to ask which paths end costs more than the payoff of all
+        if self.stocked:  # asking the device which paths end would cost more than the payoff of all of them
             reward = torch.where(terminated, exit_value(self.problem, step).unsqueeze(-1), 0.0)
         elif ends.any():  # the payoff of the few paths that end costs far less than that of all paths
             reward[ends] = exit_value(self.problem, Step(*(entry[ends] for entry in step))).unsqueeze(-1)

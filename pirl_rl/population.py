@@ -5,6 +5,9 @@ environment, a replay buffer, optimisers, random numbers and a run directory of 
 that it would have alone, up to rounding. An update stacks the networks and the batches of all members along a leading
 axis, and `torch.func.vmap` maps the losses over that axis, so that they are compiled once and evaluated together. The
 members play one after another.
+
+On a GPU, where updates are recorded, they play together in one environment, see `pirl_rl.collectors.joint`. A run then
+equals the one alone in law only, since the members share the random numbers of the steps.
 """
 
 from __future__ import annotations

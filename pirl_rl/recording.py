@@ -15,6 +15,9 @@ from typing import Any
 
 import torch
 
+KEPT = 4
+"""The number of recordings that an object keeps: updates with and without the actor's, before and after a change."""
+
 Work = Callable[[], Any]
 """A function without arguments, whose results are tensors on the device, alone or in containers."""
 
@@ -70,23 +73,22 @@ class Recorded:
 
 
 class Recordings:
-    """One recording for each kind of work that an object does, of which the latest few are kept.
+    """One recording for each kind of work that an object does, of which the latest `KEPT` are kept.
 
     Args:
         name: see `Recorded`.
         generators: see `Recorded`.
-        kept: the number of recordings that are kept.
     """
 
-    def __init__(self, name: str, generators: Sequence[torch.Generator] = (), kept: int = 4):
-        self.name, self.generators, self.kept = name, generators, kept
+    def __init__(self, name: str, generators: Sequence[torch.Generator] = ()):
+        self.name, self.generators = name, generators
         self._recorded: dict[Hashable, Recorded] = {}
 
     def __call__(self, kind: Hashable, work: Work) -> Any:
         """Do work of a kind; all work of one kind has the same kernels on the same memory."""
         if kind not in self._recorded:
             self._recorded[kind] = Recorded(work, self.name, self.generators)
-            while len(self._recorded) > self.kept:
+            while len(self._recorded) > KEPT:
                 del self._recorded[next(iter(self._recorded))]
         return self._recorded[kind]()
 

@@ -8,6 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+STEPS_PER_STATE = 4
+"""A `Stock` has one initial state for so many steps of a path; most steps end no episode."""
+
 Draw = Callable[[int], tuple[Tensor, Tensor]]
 """Draws a number of initial states: control steps to go (count,) and states (count, n)."""
 
@@ -56,9 +59,6 @@ class Stock:
         groups: the number of queues, each for an equal number of paths in a row.
     """
 
-    SHARE = 4
-    """A queue has a state for this part of the steps of its paths; most steps end no episode."""
-
     def __init__(self, groups: int = 1):
         self.groups, self._left = groups, 0
         self._steps, self._states = torch.empty(groups, 0, dtype=torch.int64), torch.empty(groups, 0, 0)
@@ -66,7 +66,7 @@ class Stock:
 
     def fill(self, steps: int, paths: int, draw: Draw) -> None:
         """Fill the queues for the next steps of all paths."""
-        size = paths // self.groups * -(-steps // self.SHARE)
+        size = paths // self.groups * -(-steps // STEPS_PER_STATE)
         counts, states = draw(self.groups * size)
         counts, states = counts.reshape(self.groups, size), states.reshape(self.groups, size, -1)
         if self._states.shape == states.shape:

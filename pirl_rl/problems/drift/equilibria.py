@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import root
 from torch import Tensor
 
-from pirl_rl.problems.drift.constant import Constant
+from pirl_rl.constants import Constant
 from pirl_rl.problems.drift.vehicle import accelerations
 
 DEGREE = math.pi / 180

@@ -13,11 +13,10 @@ import math
 import torch
 from torch import Tensor
 
-from pirl_rl.constants import constant
+from pirl_rl.constants import Constant, constant
 from pirl_rl.payoffs import Payoff
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems.drift import vehicle
-from pirl_rl.problems.drift.constant import Constant
 from pirl_rl.problems.drift.equilibria import CURVATURE, DEGREE, FRICTION_BAND, SPEED, EquilibriumCurves
 from pirl_rl.sets import Box, Plane
 
