@@ -213,9 +213,10 @@ class Learner:
             if not self._largest.item() < EXPLOSION:
                 raise DivergenceError(f"update {update}: a loss is not finite or above {EXPLOSION:.0e}")
             self._largest.zero_()
-        for name, parameter in self.loss.named_parameters():
-            if not parameter.isfinite().all():
-                raise DivergenceError(f"update {update}: the parameter {name} is not finite")
+        finite = {name: parameter.isfinite().all() for name, parameter in self.loss.named_parameters()}
+        if not torch.stack(list(finite.values())).all():  # one question to the device for all of them
+            spoilt = next(name for name, whole in finite.items() if not whole)
+            raise DivergenceError(f"update {update}: the parameter {spoilt} is not finite")
 
     def state_dict(self) -> dict[str, Any]:
         return {

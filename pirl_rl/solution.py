@@ -72,9 +72,14 @@ class Solution:
     @torch.no_grad()
     def value(self, tau: Tensor, x: Tensor) -> Tensor:
         """V (N,): 1 in A, 0 in B and in unreachable states, and elsewhere `raw_value` clipped to [0, 1]."""
+        return self.corrected(self.raw_value(tau, x), x)
+
+    @torch.no_grad()
+    def corrected(self, v: Tensor, x: Tensor) -> Tensor:
+        """`value` (N,), given the `raw_value` v (N,)."""
         x = self.problem.states.wrap(x)
         lost = self.problem.failed(x) | self.problem.unreachable(x)
-        return self.raw_value(tau, x).clamp(0, 1).masked_fill(self.problem.reached(x), 1.0).masked_fill(lost, 0.0)
+        return v.clamp(0, 1).masked_fill(self.problem.reached(x), 1.0).masked_fill(lost, 0.0)
 
     @torch.no_grad()
     def residual(self, tau: Tensor, x: Tensor, u: Tensor | None = None) -> Tensor:

@@ -314,6 +314,7 @@ class Trainer:
             DivergenceError: where the networks are spoilt; the checkpoint before stays.
         """
         self.learner.check(self.update)
+        self._saved_at = time.perf_counter()
         if self.folder is None:
             return
         run = RunDirectory(self.folder)
@@ -321,7 +322,7 @@ class Trainer:
         if keep_weights:
             weights = {"loss": self.learner.loss.state_dict(), "update": self.update}
             checkpoint.save(weights, run.weights(self.update))
-        self.saved, self._saved_at = self.update, time.perf_counter()
+        self.saved = self.update
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that an exact continuation needs, as tensors and plain values."""

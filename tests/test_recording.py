@@ -150,6 +150,35 @@ def test_a_run_goes_on_where_nothing_is_recorded_and_back(monkeypatch, tmp_path)
         assert trainer.update == updates
 
 
+class Refusing(TorchDispatchMode):
+    """Fails in the midst of what it sees, as a recording of a problem that copies numbers to the device does."""
+
+    def __init__(self):
+        super().__init__()
+        self.left = 40
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.left -= 1
+        if self.left < 0:
+            raise RuntimeError("no number goes to the device")
+        return func(*args, **(kwargs or {}))
+
+
+def test_training_goes_on_where_recordings_fail(as_on_a_gpu, monkeypatch, tmp_path):
+    failed = []
+
+    def fails(self: Recorded) -> None:
+        with pytest.raises(RuntimeError, match="no number"), Refusing():
+            self.work()
+        failed.append(self.name)
+
+    monkeypatch.setattr(Recorded, "_record", fails)
+    trainer = small_trainer(tmp_path, "compile=false", "trainer.updates=12")
+    trainer.train()
+    assert trainer.update == 12
+    assert {*failed} == {"an update", "playing"}
+
+
 def test_a_divergence_is_found_at_the_next_row(as_on_a_gpu, monkeypatch, tmp_path):
     monkeypatch.setattr(Recorded, "_record", emulated)
     trainer = small_trainer(tmp_path, "compile=false", "trainer.updates=40", "trainer.log_every=3")

@@ -8,8 +8,9 @@ import math
 
 import pytest
 import torch
-from small import PHYSICS, assert_same, at_update, interrupt, resumed, small_trainer
+from small import EVENTS, PHYSICS, assert_same, at_update, interrupt, resumed, small_config, small_trainer
 
+from pirl_rl.assembly import make_trainer
 from pirl_rl.checkpoint import load
 from pirl_rl.errors import CheckpointError, DivergenceError, Interrupted
 from pirl_rl.run_directory import RunDirectory
@@ -190,3 +191,12 @@ def test_an_update_is_a_step_of_the_optimiser_along_the_gradient_of_backward(com
         learner.loss.qvalue_network_params.parameters(), expected.qvalue_network_params.parameters(), strict=True
     )
     assert all(torch.allclose(one, other, atol=1e-5) for one, other in pairs)
+
+
+def test_training_in_memory_is_not_checked_at_each_update_once_a_checkpoint_is_late(monkeypatch):
+    trainer, checks = make_trainer(small_config(*EVENTS, "trainer.checkpoint_every=0")), []
+    monkeypatch.setattr(trainer.learner, "check", checks.append)
+    trainer.update, trainer._saved_at = 7, -math.inf
+    for _ in range(3):
+        trainer.keep(stop=False)
+    assert checks == [7]

@@ -6,22 +6,19 @@ the launches of kernels. The policies have equal networks, so that `torch.func.v
 
 from __future__ import annotations
 
-import copy
 from collections import deque
 from collections.abc import Sequence
-from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from pirl_rl.collectors.joint_states import JointStates, StackedNetworks
 from pirl_rl.collectors.player import Player
 from pirl_rl.collectors.sync import SyncCollector
 from pirl_rl.collectors.transitions import ControlVariate, Exploration, PlayedPolicy
 from pirl_rl.compilation import Compiled
-from pirl_rl.envs import ReachAvoidEnv
-from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.solution import Solution
 
 WAITING = 8
@@ -75,35 +72,6 @@ class JointPlayer:
         return self.player.play()
 
 
-class JointStates:
-    """The initial states of several environments side by side, each from its own distribution and random generator.
-
-    Args:
-        envs: the M environments. A number of states is a multiple of M, and the states are in the order (M, *).
-    """
-
-    def __init__(self, envs: Sequence[ReachAvoidEnv]):
-        self.envs = envs
-
-    def sample(
-        self,
-        problem: ReachAvoidProblem,
-        count: int,
-        max_steps: int,
-        rng: torch.Generator,
-        dtype: torch.dtype,
-        visited: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor]:
-        members = len(self.envs)
-        seen = [None] * members if visited is None else visited.chunk(members)
-        drawn = [
-            env.initial_states.sample(problem, count // members, max_steps, env.rng, dtype, own)
-            for env, own in zip(self.envs, seen, strict=True)
-        ]
-        steps, states = zip(*drawn, strict=True)
-        return torch.cat(steps), torch.cat(states)
-
-
 class JointPolicy(TensorDictModuleBase):
     """The policies of several trainings: path number i N + j of M N paths follows policy i.
 
@@ -118,49 +86,41 @@ class JointPolicy(TensorDictModuleBase):
         first = policies[0]
         self.in_keys, self.out_keys = list(first.in_keys), list(first.out_keys)  # type: ignore[assignment]
         self.exploration = Exploration(first.exploration.deviation, first.exploration.when)  # type: ignore[arg-type]
-        self._policies, self._members = [policies], len(policies)  # lists are no modules
-        self._networks: list[TensorDictBase] = []
-        self._twins = [[copy.deepcopy(network) for network in self._of(first)]]
+        self._members = len(policies)
+        self._networks = [StackedNetworks([self._of(policy) for policy in policies])]  # a list is no module
         variate = first.control_variate
         self._variate: list[ControlVariate] = []
         if variate is not None:
-            solution = Solution(variate.simulator.problem, *self._twins[0])  # type: ignore[arg-type]
+            solution = Solution(variate.simulator.problem, *self._networks[0].twins)  # type: ignore[arg-type]
             self._variate = [ControlVariate(solution, variate.simulator, variate.compiles, variate.limit)]
         every = torch.func.vmap(self._of_member, in_dims=(0, 0, 0, None))
         compiled = variate is not None and variate.compiles
         self._every = [Compiled(every, "the policies of all members") if compiled else every]
-        self.gather()
 
-    @torch.no_grad()
     def gather(self) -> None:
         """Take over the parameters of all policies, into memory that stays where it is."""
-        kinds = zip(*(self._of(policy) for policy in self._policies[0]), strict=True)
-        stacked: list[Any] = [TensorDict.stack([TensorDict.from_module(one) for one in kind]).data for kind in kinds]
-        if not self._networks:
-            self._networks = [kind.clone() for kind in stacked]
-        for own, new in zip(self._networks, stacked, strict=True):
-            own.update_(new)
+        self._networks[0].gather()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         tau, state = (tensordict[key].unflatten(0, (self._members, -1)) for key in ("tau", "state"))
         device: torch.device = state.device  # type: ignore[assignment, union-attr]
         constant = self._variate[0].simulator.constant_sigma(device) if self._variate else None
-        loc, slope = (part.flatten(0, 1) for part in self._every[0](self._networks, tau, state, constant))
+        loc, slope = (part.flatten(0, 1) for part in self._every[0](self._networks[0].params, tau, state, constant))
         action = self.exploration(loc, tensordict["is_init"])
         tensordict.set("loc", loc).set("action", action).set("played", action.clone())
         return tensordict.set("slope", slope) if self._variate else tensordict
 
     def _of_member(
-        self, networks: Sequence[TensorDictBase], tau: Tensor, state: Tensor, constant: Tensor | None
+        self, params: Sequence[TensorDictBase], tau: Tensor, state: Tensor, constant: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """The action (N, m) of one policy and the slope (N, n) of its V."""
         kept = {"preserve_module_state": False}
-        actor, *critics = self._twins[0]
-        with networks[0].to_module(actor, **kept):
+        actor, *critics = self._networks[0].twins
+        with params[0].to_module(actor, **kept):
             loc = actor(tau, state)
         if not critics:
             return loc, torch.zeros_like(state)
-        with networks[1].to_module(critics[0], **kept):
+        with params[1].to_module(critics[0], **kept):
             return loc, self._variate[0](tau, state, loc, constant)
 
     @staticmethod

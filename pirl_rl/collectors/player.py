@@ -92,11 +92,8 @@ class Player:
         """The transitions of the next batch, with paths that stay in the memory of `_paths`."""
         assert self._paths is not None
         carry(self.collector, self._paths.copy())
-        try:
-            transitions = self.transitions(next(self._batches))
-        except RuntimeError:
-            del self._batches  # an iterator ends with an error, as of a recording that fails
-            raise
+        # An iterator of the collector would close it after an error, as of a recording that fails.
+        transitions = self.transitions(self.collector.rollout())
         self._paths.update_(carried(self.collector).select(*self._paths.keys()))
         carry(self.collector, self._paths.copy())
         return transitions

@@ -99,6 +99,8 @@ class NearFaces:
         ArgumentError: a number is out of range.
     """
 
+    common = True
+
     def __init__(self, others: InitialStates, share: float = 0.3, decades: float = 3.0):
         if not 0 <= share <= 1 or not decades > 0:
             raise ArgumentError(f"initial_states: expected 0 <= share <= 1 and decades > 0, got {share} and {decades}")

@@ -20,7 +20,11 @@ Tau = Literal["fixed", "random", "both"]
 
 @runtime_checkable
 class InitialStates(Protocol):
-    """A distribution of the initial states of episodes."""
+    """A distribution of the initial states of episodes.
+
+    A class with the attribute `common = True` promises that its states depend neither on V nor on `visited`, but for
+    those of a distribution in its attribute `others`. Trainings that play together on a GPU then draw theirs at once.
+    """
 
     def sample(
         self,
@@ -62,6 +66,8 @@ class UniformStates:
     Raises:
         ArgumentError: only one corner is given, the corners are no box, or `tau` is unknown.
     """
+
+    common = True
 
     def __init__(
         self,

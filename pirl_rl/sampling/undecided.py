@@ -37,6 +37,10 @@ class UndecidedStates:
         floor: the weight of a state at which V is 0 or 1, where a state at which V = 1/2 has the weight 1; in (0, 1].
         candidates: the number of candidates for each state, >= 1.
 
+    Attributes:
+        groups: the states are in the order (groups, *), and each group is drawn from its own candidates; 1 but for
+            several trainings that play together, each of which has its own V.
+
     Raises:
         ArgumentError: a number is out of range.
     """
@@ -54,7 +58,7 @@ class UndecidedStates:
                 f"initial_states: expected 0 < floor <= 1 and candidates >= 1, got {floor} and {candidates}"
             )
         self.others, self.solution, self.clock = others, solution, simulator.clock
-        self.floor, self.candidates = floor, candidates
+        self.floor, self.candidates, self.groups = floor, candidates, 1
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"solution": None}
@@ -74,5 +78,7 @@ class UndecidedStates:
         # The trainer reports networks that have diverged.
         v = self.solution.value(self.clock.time(steps).to(x), x).nan_to_num(0.5).clamp(0, 1)
         weight = self.floor + (1 - self.floor) * 4 * v * (1 - v)
-        chosen = torch.multinomial(weight, count, generator=rng)
+        chosen = torch.multinomial(weight.reshape(self.groups, -1), count // self.groups, generator=rng)
+        rows = torch.arange(self.groups, device=x.device).unsqueeze(-1) * (len(x) // self.groups)
+        chosen = (chosen + rows).flatten()
         return steps[chosen], x[chosen]

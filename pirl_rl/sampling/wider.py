@@ -49,6 +49,8 @@ class WiderStates:
         ArgumentError: `share` is out of range.
     """
 
+    common = True
+
     def __init__(self, others: InitialStates, simulator: Simulator, share: float = 0.5):
         if not 0 <= share <= 1:
             raise ArgumentError(f"initial_states: expected 0 <= share <= 1, got {share}")

@@ -29,6 +29,8 @@ class EquilibriumStates:
         ArgumentError: `scale` or `mixture` is out of range, or `tau` is unknown.
     """
 
+    common = True
+
     def __init__(
         self,
         scale: float | Sequence[float] = 1.0,
