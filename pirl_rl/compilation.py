@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
+from torch.fx.experimental.proxy_tensor import make_fx
+from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from pirl_rl.progress import announce
 
@@ -33,17 +36,80 @@ def compiled(function: Callable[..., Any], whole: bool = False) -> Callable[...,
     return torch.compile(function, fullgraph=whole, dynamic=False, isolate_recompiles=True)  # pyright: ignore
 
 
+class TraceError(Exception):
+    """The operations of a function cannot be traced."""
+
+
+class Traced:
+    """A function that is compiled from traces of its operations, one for each kind of arguments.
+
+    The compiler reads the Python code of a function, and where `torch.func.vmap` maps it, that takes twenty times as
+    long as a trace. A trace has the operations of one call, so that nothing but the numbers in the given tensors may
+    differ in another call, or be asked for. `vmap` refuses to be asked, which makes this the right way for what it
+    maps.
+
+    The results have no gradient; the function itself may contain `torch.autograd.grad`.
+
+    Args:
+        function: maps tensors, alone or in containers, to tensors, alone or in containers.
+    """
+
+    def __init__(self, function: Callable[..., Any]):
+        self.function = function
+        self._programs: dict[Any, tuple[Callable[..., list[Tensor]], Any]] = {}
+
+    def __call__(self, *args: Any) -> Any:
+        leaves, structure = tree_flatten(args)
+        tensors = [leaf for leaf in leaves if isinstance(leaf, Tensor)]
+        kind = structure, *(_kind(leaf) for leaf in leaves)
+        if kind not in self._programs:
+            self._programs[kind] = self._traced(leaves, structure, tensors)
+        program, results = self._programs[kind]
+        with torch.no_grad():
+            return tree_unflatten(_replaced(results[0], program(*tensors)), results[1])
+
+    def _traced(self, leaves: list[Any], structure: Any, tensors: list[Tensor]) -> tuple[Callable[..., Any], Any]:
+        """The compiled trace, from tensors to the tensors among the results, and all results with their structure."""
+        results: list[Any] = []
+
+        def flat(*given: Tensor) -> list[Tensor]:
+            found = self.function(*tree_unflatten(_replaced(leaves, given), structure))
+            results[:] = tree_flatten(found)
+            return [leaf for leaf in results[0] if isinstance(leaf, Tensor)]
+
+        own = [tensor.detach().requires_grad_(tensor.requires_grad) for tensor in tensors]
+        try:
+            graph = make_fx(flat)(*own)
+        except Exception as error:
+            raise TraceError(str(error)) from error
+        return compiled(graph, whole=True), ([_kind(leaf) for leaf in results[0]], results[1])
+
+
+def _kind(leaf: Any) -> Any:
+    """What decides which program a leaf needs: of a tensor all but its numbers, of anything else the thing itself."""
+    if not isinstance(leaf, Tensor):
+        return leaf
+    return Tensor, leaf.shape, leaf.stride(), leaf.dtype, leaf.device, leaf.requires_grad
+
+
+def _replaced(leaves: Sequence[Any], tensors: Sequence[Tensor]) -> list[Any]:
+    """The leaves with other tensors in the places of theirs, or of their kinds."""
+    new = iter(tensors)
+    return [next(new) if isinstance(leaf, (Tensor, tuple)) else leaf for leaf in leaves]
+
+
 class Compiled:
     """A function that is compiled at its first call; where that fails, it runs eagerly after one warning.
 
     Args:
         function: maps tensors to tensors, without side effects.
         name: of the function, for the warning.
+        traced: whether it is compiled from a trace, see `Traced`.
     """
 
-    def __init__(self, function: Callable[..., Any], name: str):
+    def __init__(self, function: Callable[..., Any], name: str, traced: bool = False):
         self.function, self.name, self._begun = function, name, False
-        self._called: Callable[..., Any] = compiled(function, whole=True)
+        self._called: Callable[..., Any] = Traced(function) if traced else compiled(function, whole=True)
 
     def __call__(self, *args: Any) -> Any:
         if not self._begun:
@@ -54,12 +120,13 @@ class Compiled:
         except Exception as error:
             if self._called is self.function or not is_compiler_failure(error):
                 raise
+            result = self.function(*args)  # an error of its own has no warning before it
             warnings.warn(f"{self.name} runs eagerly, which is slower: {reason_of(error)}", stacklevel=2)
             self._called = self.function
-            return self.function(*args)
+            return result
 
 
-def rowwise(function: Callable[..., torch.Tensor], name: str) -> Callable[..., torch.Tensor]:
+def rowwise(function: Callable[..., Tensor], name: str) -> Callable[..., Tensor]:
     """The function, compiled also where `torch.func.vmap` maps it; where gradients are taken, it runs eagerly.
 
     A compiled function cannot be mapped. This one gets the rows of all members at once.
@@ -70,7 +137,7 @@ def rowwise(function: Callable[..., torch.Tensor], name: str) -> Callable[..., t
     """
     compiled_function = Compiled(function, name)
 
-    def called(*rows: torch.Tensor) -> torch.Tensor:
+    def called(*rows: Tensor) -> Tensor:
         return function(*rows) if torch.is_grad_enabled() else _Rowwise.apply(compiled_function, *rows)  # type: ignore
 
     return called
@@ -80,7 +147,7 @@ class _Rowwise(torch.autograd.Function):
     """A function of rows without gradients, which is mapped by making one axis of the members and the rows."""
 
     @staticmethod
-    def forward(function: Callable[..., torch.Tensor], *rows: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
+    def forward(function: Callable[..., Tensor], *rows: Tensor) -> Tensor:  # type: ignore[override]
         return function(*rows)
 
     @staticmethod
@@ -88,7 +155,7 @@ class _Rowwise(torch.autograd.Function):
         pass
 
     @staticmethod
-    def vmap(info: Any, in_dims: Any, function: Callable[..., torch.Tensor], *rows: torch.Tensor) -> Any:
+    def vmap(info: Any, in_dims: Any, function: Callable[..., Tensor], *rows: Tensor) -> Any:
         members = info.batch_size
         moved = [
             row.expand(members, *row.shape) if axis is None else row.movedim(axis, 0)
@@ -104,7 +171,7 @@ def is_compiler_failure(error: Exception) -> bool:
     from torch._dynamo.exc import TorchDynamoException
     from torch._inductor.exc import InductorError
 
-    return isinstance(error, (TorchDynamoException, InductorError))
+    return isinstance(error, (TorchDynamoException, InductorError, TraceError))
 
 
 def reason_of(error: Exception) -> str:
@@ -135,5 +202,5 @@ def _trace_gradients() -> None:
     torch._dynamo.config.trace_autograd_ops = True
 
 
-def _filled(size: Any, **options: Any) -> torch.Tensor:
+def _filled(size: Any, **options: Any) -> Tensor:
     return torch.ops.aten.full.default(size, 0, **options)

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from pirl_rl import checkpoint
 from pirl_rl.collectors import SyncCollector
-from pirl_rl.collectors.joint import JointPlayer
+from pirl_rl.collectors.joint import JointPlayer, share_program
 from pirl_rl.compilation import Compiled, rowwise
 from pirl_rl.errors import ArgumentError, DivergenceError, Interrupted
 from pirl_rl.gradients import Gradient, Terms
@@ -73,7 +73,7 @@ class Population:
         if len(kinds) != 1:
             raise ArgumentError("population: expected members with the same updates and networks of the same shapes")
         self.members, self._numbers = members, list(numbers)
-        _share_simulator(members)
+        _share_programs(members)
         self.errors: dict[int, DivergenceError] = {}
         self._losses = StackedLosses(members[0].learner.gradients.compile)
         self._records = all(member.records for member in members)
@@ -312,20 +312,24 @@ class StackedLosses:
             return found.detach(), terms, torch.autograd.grad(found.sum(), trained, allow_unused=True)
 
         whole = which == "critic" or loss.actor_rule.compiles_whole
-        return Compiled(program, f"the loss of the {which}s") if self.compile and whole else program
+        return Compiled(program, f"the loss of the {which}s", traced=True) if self.compile and whole else program
 
     def _mapped(self, inner: Callable[..., Tensor]) -> Callable[..., Tensor]:
         """An inner function of an actor rule, in a form that can be mapped over the members."""
         return rowwise(inner, "an inner function of the actor's loss") if self.compile else inner
 
 
-def _share_simulator(members: Sequence[Trainer]) -> None:
-    """Let all members play the simulator of the first where theirs are equal, so that it is compiled once."""
-    playing = [(member, member.collector.env) for member in members if isinstance(member.collector, SyncCollector)]
-    for member, env in playing:
-        first = playing[0][1].simulator
-        if env.simulator == first:
-            env.simulator = first
+def _share_programs(members: Sequence[Trainer]) -> None:
+    """Let all members play the simulator and the policy of the first, so that they are compiled once."""
+    collectors = [member.collector for member in members]
+    playing = [one for one in collectors if isinstance(one, SyncCollector)]
+    if len(playing) < len(collectors):
+        return
+    share_program([one.policy for one in playing])
+    for member, collector in zip(members, playing, strict=True):
+        first = playing[0].env.simulator
+        if collector.env.simulator == first:
+            collector.env.simulator = first
             if member.simulator.shared is not None:
                 member.simulator.share(first)
 

@@ -17,7 +17,7 @@ from pirl_rl import learner
 from pirl_rl.actor_rules import BestControl, ClippedSurrogate, LookAhead
 from pirl_rl.assembly import make_trainer
 from pirl_rl.commands.composition import compose
-from pirl_rl.compilation import compiled, rowwise
+from pirl_rl.compilation import Compiled, compiled, rowwise
 from pirl_rl.evaluation import statements_of
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.simulator import Simulator
@@ -208,3 +208,49 @@ def test_a_function_of_rows_is_compiled_where_it_is_mapped():
     mapped(x[0], y[0]).sum().backward()  # gradients need the function itself
     assert eager == [(5, 2)]
     torch.testing.assert_close(x.grad[0], x[0].detach().cos() * y[0].unsqueeze(-1))
+
+
+def fitted(network: torch.nn.Linear):
+    """The error of each member at its rows beside a network, with the gradient in the weights of the members."""
+
+    def program(own: dict[str, torch.Tensor], scale: float, weights: list[torch.Tensor], offset: torch.Tensor | None):
+        def of_member(x, weight):
+            shift = 0.0 if offset is None else offset
+            return ((network(x) - x @ weight + shift) * scale).square().mean()
+
+        errors = torch.func.vmap(of_member)(own["x"], weights[0])
+        return errors.detach(), {"grad": torch.autograd.grad(errors.sum(), weights)}, None
+
+    return program
+
+
+@needs_compiler
+def test_a_traced_function_is_the_function(recwarn):
+    torch.manual_seed(0)
+    network = torch.nn.Linear(3, 2)
+    function = fitted(network)
+    traced = Compiled(function, "the errors", traced=True)
+    for members, rows, scale, offset in ((4, 5, 1.0, None), (2, 5, 1.0, None), (2, 5, 3.0, torch.ones(2))):
+        for _ in range(2):
+            x, weight = torch.randn(members, rows, 3), torch.randn(members, 3, 2, requires_grad=True)
+            arguments = {"x": x}, scale, [weight], offset
+            torch.testing.assert_close(traced(*arguments), function(*arguments))
+            with torch.no_grad():  # what it holds may change in place
+                network.weight.mul_(-1.5)
+    assert len(traced._called._programs) == 3
+    assert not [one for one in recwarn if "runs eagerly" in str(one.message)]
+
+
+def test_what_cannot_be_traced_runs_eagerly_or_has_its_own_error():
+    def branches(x):
+        return x * 2 if x.sum().item() > 0 else x
+
+    traced = Compiled(branches, "the branches", traced=True)
+    with pytest.warns(UserWarning, match="the branches runs eagerly"):
+        assert traced(torch.ones(3)).tolist() == [2.0] * 3
+    assert traced(-torch.ones(3)).tolist() == [-1.0] * 3
+    mapped = Compiled(torch.func.vmap(branches), "the branches", traced=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(RuntimeError, match="vmap"):
+            mapped(torch.ones(2, 3))

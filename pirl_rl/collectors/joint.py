@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
@@ -86,44 +88,86 @@ class JointPolicy(TensorDictModuleBase):
         first = policies[0]
         self.in_keys, self.out_keys = list(first.in_keys), list(first.out_keys)  # type: ignore[assignment]
         self.exploration = Exploration(first.exploration.deviation, first.exploration.when)  # type: ignore[arg-type]
-        self._members = len(policies)
-        self._networks = [StackedNetworks([self._of(policy) for policy in policies])]  # a list is no module
-        variate = first.control_variate
-        self._variate: list[ControlVariate] = []
-        if variate is not None:
-            solution = Solution(variate.simulator.problem, *self._networks[0].twins)  # type: ignore[arg-type]
-            self._variate = [ControlVariate(solution, variate.simulator, variate.compiles, variate.limit)]
-        every = torch.func.vmap(self._of_member, in_dims=(0, 0, 0, None))
-        compiled = variate is not None and variate.compiles
-        self._every = [Compiled(every, "the policies of all members") if compiled else every]
+        self._members, self._program = len(policies), [StackedPolicies(policies)]  # a list is no module
 
     def gather(self) -> None:
         """Take over the parameters of all policies, into memory that stays where it is."""
-        self._networks[0].gather()
+        self._program[0].networks.gather()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         tau, state = (tensordict[key].unflatten(0, (self._members, -1)) for key in ("tau", "state"))
-        device: torch.device = state.device  # type: ignore[assignment, union-attr]
-        constant = self._variate[0].simulator.constant_sigma(device) if self._variate else None
-        loc, slope = (part.flatten(0, 1) for part in self._every[0](self._networks[0].params, tau, state, constant))
+        loc, slope = (part.flatten(0, 1) for part in self._program[0](tau, state))
         action = self.exploration(loc, tensordict["is_init"])
         tensordict.set("loc", loc).set("action", action).set("played", action.clone())
-        return tensordict.set("slope", slope) if self._variate else tensordict
+        return tensordict.set("slope", slope) if "slope" in self.out_keys else tensordict
+
+
+class StackedPolicies:
+    """The actors and control variates of several trainings in one program.
+
+    Attributes:
+        networks: the actors and, with a control variate, the critics.
+
+    Args:
+        policies: the policies of M trainings with equal settings, whose networks have equal shapes.
+    """
+
+    def __init__(self, policies: Sequence[PlayedPolicy]):
+        self.networks = StackedNetworks([self.networks_of(policy) for policy in policies])
+        variate = policies[0].control_variate
+        self._variate: ControlVariate | None = None
+        if variate is not None:
+            solution = Solution(variate.simulator.problem, *self.networks.twins)  # type: ignore[arg-type]
+            self._variate = ControlVariate(solution, variate.simulator, variate.compiles, variate.limit)
+        every = torch.func.vmap(self._of_member, in_dims=(0, 0, 0, None))
+        compiles = variate is not None and variate.compiles
+        self._every = Compiled(every, "the policy of all members", traced=True) if compiles else every
+
+    def __call__(
+        self, tau: Tensor, state: Tensor, params: Sequence[TensorDictBase] | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """The actions (M, N, m) and the slopes (M, N, n) of V at tau (M, N, 1) and state (M, N, n).
+
+        Args:
+            tau, state: the points of each training.
+            params: other parameters (M, ...) of the networks than those of the trainings.
+        """
+        constant = self._variate.simulator.constant_sigma(state.device) if self._variate else None
+        return self._every(self.networks.params if params is None else params, tau, state, constant)
 
     def _of_member(
         self, params: Sequence[TensorDictBase], tau: Tensor, state: Tensor, constant: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """The action (N, m) of one policy and the slope (N, n) of its V."""
         kept = {"preserve_module_state": False}
-        actor, *critics = self._networks[0].twins
+        actor, *critics = self.networks.twins
         with params[0].to_module(actor, **kept):
             loc = actor(tau, state)
-        if not critics:
+        if self._variate is None:
             return loc, torch.zeros_like(state)
         with params[1].to_module(critics[0], **kept):
-            return loc, self._variate[0](tau, state, loc, constant)
+            return loc, self._variate(tau, state, loc, constant)
 
     @staticmethod
-    def _of(policy: PlayedPolicy) -> list[torch.nn.Module]:
+    def networks_of(policy: PlayedPolicy) -> list[torch.nn.Module]:
         """The networks of a policy: its actor and, with a control variate, its critic."""
         return [policy.actor, *([] if policy.control_variate is None else [policy.control_variate.critic])]
+
+
+def share_program(policies: Sequence[PlayedPolicy]) -> None:
+    """Let policies that play alone, with equal settings and networks of equal shapes, play one compiled program."""
+    variate = policies[0].control_variate
+    if variate is None or not variate.compiles:
+        return
+    program = StackedPolicies(policies[:1])
+    for policy in policies:
+        own: list[Any] = [TensorDict.from_module(network) for network in StackedPolicies.networks_of(policy)]
+        own = [params.data.unsqueeze(0) for params in own]
+        policy.play_by(partial(_alone, program, own))
+
+
+def _alone(
+    program: StackedPolicies, params: Sequence[TensorDictBase], tau: Tensor, state: Tensor, constant: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    loc, slope = program(tau.unsqueeze(0), state.unsqueeze(0), params)
+    return loc.squeeze(0), slope.squeeze(0)

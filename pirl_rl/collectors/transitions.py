@@ -12,6 +12,7 @@ The cost is one gradient of V at each step, for any number of noise channels.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal
 
 import torch
@@ -115,7 +116,11 @@ class PlayedPolicy(TensorDictModuleBase):
         self.actor, self.exploration, self.control_variate = actor, exploration, control_variate
         self.in_keys = ["tau", "state", "is_init"]
         self.out_keys = ["loc", "action", "played", *([] if control_variate is None else ["slope"])]
-        self._compiled: Compiled | None = None
+        self._compiled: Callable[..., tuple[Tensor, Tensor]] | None = None
+
+    def play_by(self, program: Callable[..., tuple[Tensor, Tensor]]) -> None:
+        """Play a program that maps tau, state and `constant_sigma` to the actor's output and the slope of V."""
+        self._compiled = program
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         tau, state = tensordict["tau"], tensordict["state"]
