@@ -73,7 +73,7 @@ def main() -> None:
                 f"{last['memory']:.1f} |",
                 flush=True,
             )
-            save(arguments.json, ratios, rows=rows)
+            save(arguments.json, ratios, "cuda", rows=rows)
 
 
 if __name__ == "__main__":

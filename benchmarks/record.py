@@ -11,16 +11,17 @@ from pirl_rl.files import replacing
 from pirl_rl.machine import describe
 
 
-def save(path: Path | None, ratios: Mapping[str, float], **found: Any) -> None:
+def save(path: Path | None, ratios: Mapping[str, float], device: str = "cpu", **found: Any) -> None:
     """Write the record of a benchmark, unless the path is None.
 
     Args:
         path: the file; its folder is made if it is not there.
         ratios: quotients of times or of rates that were measured in turns, by name. A larger one is better. They vary
             less from machine to machine than the times themselves.
+        device: where the work was done.
         found: everything else that was measured, as plain values.
     """
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as file:
-            file.write(json.dumps({"machine": describe(), "ratios": ratios, **found}, indent=2) + "\n")
+            file.write(json.dumps({"machine": describe(device), "ratios": ratios, **found}, indent=2) + "\n")

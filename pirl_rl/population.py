@@ -90,7 +90,7 @@ class Population:
         """
         joint = None
         try:
-            with interruptible() as interrupted:
+            with interruptible() as interrupted, _without_denormals():
                 joint = self._join()
                 for index, member in enumerate(self.members):
                     with self._as_alone(index):
@@ -317,6 +317,20 @@ class StackedLosses:
     def _mapped(self, inner: Callable[..., Tensor]) -> Callable[..., Tensor]:
         """An inner function of an actor rule, in a form that can be mapped over the members."""
         return rowwise(inner, "an inner function of the actor's loss") if self.compile else inner
+
+
+@contextmanager
+def _without_denormals() -> Iterator[None]:
+    """Take numbers below 1e-38 as 0, which gradients contain where V is near 0 or 1.
+
+    With them a batched product of matrices takes a processor four times as long. Other products do so by themselves.
+    """
+    before = torch.tensor(1e-39).mul(1.0).item() == 0
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(before)
 
 
 def _share_programs(members: Sequence[Trainer]) -> None:
