@@ -12,45 +12,29 @@ equals the one alone in law only, since the members share the random numbers of 
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 
 from pirl_rl import checkpoint
 from pirl_rl.collectors import SyncCollector
 from pirl_rl.collectors.joint import JointPlayer, share_program
-from pirl_rl.compilation import Compiled, rowwise
 from pirl_rl.errors import ArgumentError, DivergenceError, Interrupted
-from pirl_rl.gradients import Gradient, Terms
-from pirl_rl.losses import TERMS, PIRLLoss
+from pirl_rl.gradients import Terms
+from pirl_rl.losses import TERMS
 from pirl_rl.optimizers import step_together
 from pirl_rl.progress import Progress, announce, interruptible
 from pirl_rl.recording import Recordings
 from pirl_rl.schedules import Weights
-from pirl_rl.terms import Networks
+from pirl_rl.stacked_losses import StackedLosses
 from pirl_rl.trainer import Trainer
 
 PARTS: dict[str, Any] = dict(zip(TERMS, (("replay", "next"), "collocation", "boundary"), strict=True))
 """The part of a batch that each term of the critic loss needs."""
-
-PARAMS = (
-    *("qvalue_network_params", "actor_network_params"),
-    *("target_qvalue_network_params", "target_actor_network_params"),
-)
-"""The names of the parameters of a loss: of critics, actor and their targets."""
-
-Trained = Literal["critic", "actor"]
-"""The network whose loss is meant."""
-
-
-Program = Callable[[Sequence[TensorDictBase], Sequence[Tensor], TensorDictBase], Gradient]
-"""Maps stacked parameters, weights and batches to the losses (M,), their terms (M,) and their stacked gradients."""
 
 
 class Population:
@@ -237,86 +221,6 @@ class Population:
         with self._ending(index):
             yield
         self._numbers[index] = checkpoint.global_rng_states()
-
-
-class StackedLosses:
-    """The losses of several members with the same networks and options, in one program.
-
-    Args:
-        compile: whether the program is compiled.
-    """
-
-    def __init__(self, compile: bool):
-        self.compile = compile
-        self._programs: dict[str, tuple[Any, Program]] = {}
-
-    def __call__(self, which: Trained, losses: Sequence[PIRLLoss], batch: TensorDictBase) -> list[Gradient]:
-        """The loss of the critics or of the actor of each member, with its terms and its gradient.
-
-        Args:
-            which: "critic" or "actor".
-            losses: the loss of each of the M members.
-            batch: the stacked batches of the members, (M,).
-
-        Raises:
-            ArgumentError: `torch.func.vmap` cannot map a function of the problem.
-        """
-        # The loss of one member, with the actor rule of its stage, is evaluated on the networks of all.
-        key = losses[0], losses[0].actor_rule
-        if which not in self._programs or self._programs[which][0] != key:
-            self._programs[which] = key, self._program(which, losses[0])
-        params: list[Any] = [TensorDict.stack([getattr(loss, name).data for loss in losses]) for name in PARAMS]
-        for trained in params[:2]:
-            trained.requires_grad_()
-        weights = [torch.stack(entries) for entries in zip(*(loss.networks.weights for loss in losses), strict=True)]
-        try:
-            loss, terms, gradient = self._programs[which][1](params, weights, batch)
-        except RuntimeError as error:
-            if "vmap" not in str(error):
-                raise
-            raise ArgumentError(
-                "trainer.seeds, or population of the outer loop: a function of the problem cannot be evaluated for "
-                f"several members at once ({str(error).partition(chr(10))[0]}); train them one after another, with "
-                "-m seed=0,1 or population=false"
-            ) from error
-        own = ({name: values[index] for name, values in terms.items()} for index in range(len(losses)))
-        return list(zip(loss, own, zip(*gradient, strict=True), strict=True))  # type: ignore[arg-type]
-
-    def _program(self, which: Trained, loss: PIRLLoss) -> Program:
-        function, params = loss.critic_loss, loss.qvalue_network_params
-        if which == "actor":
-            loss.actor_rule.compile(self._mapped)
-            function, params = loss.actor_loss, loss.actor_network_params
-        keys = [tuple(name.split(".")) for name, _ in params.named_parameters()]
-        # The networks of TorchRL's losses are modules without parameters, to which any can be lent.
-        empty: list[Any] = [copy.deepcopy(loss.qvalue_network) for _ in range(3)]
-        empty += [copy.deepcopy(loss.actor_network) for _ in range(2)]
-        critic, frozen, target_critic, actor, target_actor = empty
-        kept, position = {"preserve_module_state": False}, int(which == "actor")
-
-        def of_member(params: Sequence[TensorDictBase], weights: Sequence[Tensor], batch: TensorDictBase):
-            with (
-                params[0].to_module(critic, **kept),
-                params[0].detach().to_module(frozen, **kept),
-                params[1].to_module(actor, **kept),
-                params[2].to_module(target_critic, **kept),
-                params[3].to_module(target_actor, **kept),
-            ):
-                critics = critic.module, frozen.module, target_critic.module
-                return function(batch, Networks(*critics, actor.module, target_actor.module, weights))
-
-        def program(params: Sequence[TensorDictBase], weights: Sequence[Tensor], batch: TensorDictBase) -> Gradient:
-            trained = [params[position][key] for key in keys]
-            found, terms = torch.func.vmap(of_member)(params, weights, batch)
-            # A member's loss depends on its own parameters alone, so that the sum has the gradients of all.
-            return found.detach(), terms, torch.autograd.grad(found.sum(), trained, allow_unused=True)
-
-        whole = which == "critic" or loss.actor_rule.compiles_whole
-        return Compiled(program, f"the loss of the {which}s", traced=True) if self.compile and whole else program
-
-    def _mapped(self, inner: Callable[..., Tensor]) -> Callable[..., Tensor]:
-        """An inner function of an actor rule, in a form that can be mapped over the members."""
-        return rowwise(inner, "an inner function of the actor's loss") if self.compile else inner
 
 
 @contextmanager
