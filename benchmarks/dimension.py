@@ -101,11 +101,16 @@ class Term:
         self.critic = Critic(self.problem, (64, 64, 64), output="Sigmoid", **RECIPE)
         self.build(probes, delta)
         self.collocation, self.rng = Collocation(self.problem, case.points), torch.Generator().manual_seed(0)
+        self.draw()
+        if compile:
+            self.hjb_loss = compiled(self.loss.critic_loss)
+
+    def draw(self) -> TensorDict:
+        """Draw other points; returns the batch with them."""
         action = torch.zeros(1, self.problem.controls.dim)
         points = self.collocation.sample(self.rng)
         self.batch = TensorDict({"replay": TensorDict({"action": action}), "collocation": points})
-        if compile:
-            self.hjb_loss = compiled(self.loss.critic_loss)
+        return self.batch
 
     def build(self, probes: int, delta: float | None) -> None:
         """The loss of the networks as they are."""
@@ -119,7 +124,7 @@ class Term:
         slopes = torch.autograd.grad(loss, list(self.loss.qvalue_network_params.parameters()), materialize_grads=True)
         return torch.cat([loss.detach().view(1), *(slope.flatten() for slope in slopes)])
 
-    def fit(self, updates: int = 400) -> None:
+    def fit(self, updates: int) -> None:
         """Fit the critic to the exact value, and the actor to the optimal control, on random points."""
         adam = torch.optim.Adam([*self.critic.parameters(), *self.actor.parameters()], 3e-3)
         for update in range(updates):
@@ -254,11 +259,11 @@ def bias(case: Case, draws: int) -> dict[str, float]:
     return {**dict(zip(names, deviations, strict=True)), "error of the loss": (error[0] / exact[0]).item()}
 
 
-def noise(states: int, batches: int) -> dict[str, Any]:
+def noise(states: int, batches: int, updates: int = 400) -> dict[str, Any]:
     """The variance of the gradient over batches of 300 points, by the number of probes, over that of the exact one."""
     term = Term(Case(300, states, states), 0)
-    term.fit()
-    samples = [term.collocation.sample(term.rng) for _ in range(batches)]
+    term.fit(updates)
+    samples = [term.draw() for _ in range(batches)]
     total = {}
     for count in (0, 2, 4, 8):
         term.build(count, 1.0)

@@ -133,6 +133,13 @@ def test_the_memory_of_a_term_is_below_the_bound_that_the_documentation_states(p
     assert 0.5 * found["bound"] < found["held"] <= found["bound"]
 
 
+def test_random_vectors_add_no_variance_where_the_trace_has_one_channel():
+    """With one channel a Rademacher vector is its sign, so that its estimate is exact; with Huber's weight 1 too."""
+    found = dimension.noise(states=1, batches=6, updates=5)
+    assert found["states"] == 1
+    assert found["variance"] == pytest.approx(dict.fromkeys("0248", 1.0), rel=0.02)
+
+
 def test_a_bound_is_reached_at_the_first_update_below_it():
     curve = [row(50, 1e-2, 20.0), row(100, 9e-4, 21.0), row(150, 2e-3, 22.0), row(200, 5e-4, 23.0)]
     run = {"first update": {"seconds": 15.0, "processor": 8.0}, "curve": curve}
