@@ -66,23 +66,23 @@ class Traced:
             self._programs[kind] = self._traced(leaves, structure, tensors)
         program, results = self._programs[kind]
         with torch.no_grad():
-            return tree_unflatten(_replaced(results[0], program(*tensors)), results[1])
+            return tree_unflatten(_filled_in(results[0], program(*tensors)), results[1])
 
     def _traced(self, leaves: list[Any], structure: Any, tensors: list[Tensor]) -> tuple[Callable[..., Any], Any]:
-        """The compiled trace, from tensors to the tensors among the results, and all results with their structure."""
-        results: list[Any] = []
+        """The compiled trace, from tensors to the tensors among the results, and the results with blanks for them."""
+        blanks, results = _with_blanks(leaves), []
 
         def flat(*given: Tensor) -> list[Tensor]:
-            found = self.function(*tree_unflatten(_replaced(leaves, given), structure))
-            results[:] = tree_flatten(found)
-            return [leaf for leaf in results[0] if isinstance(leaf, Tensor)]
+            found, shape = tree_flatten(self.function(*tree_unflatten(_filled_in(blanks, given), structure)))
+            results[:] = _with_blanks(found), shape
+            return [leaf for leaf in found if isinstance(leaf, Tensor)]
 
         own = [tensor.detach().requires_grad_(tensor.requires_grad) for tensor in tensors]
         try:
             graph = make_fx(flat)(*own)
         except Exception as error:
             raise TraceError(str(error)) from error
-        return compiled(graph, whole=True), ([_kind(leaf) for leaf in results[0]], results[1])
+        return compiled(graph, whole=True), results
 
 
 def _kind(leaf: Any) -> Any:
@@ -92,10 +92,15 @@ def _kind(leaf: Any) -> Any:
     return Tensor, leaf.shape, leaf.stride(), leaf.dtype, leaf.device, leaf.requires_grad
 
 
-def _replaced(leaves: Sequence[Any], tensors: Sequence[Tensor]) -> list[Any]:
-    """The leaves with other tensors in the places of theirs, or of their kinds."""
+def _with_blanks(leaves: Sequence[Any]) -> list[Any]:
+    """The leaves with the class `Tensor` as a blank in the place of each tensor."""
+    return [Tensor if isinstance(leaf, Tensor) else leaf for leaf in leaves]
+
+
+def _filled_in(leaves: Sequence[Any], tensors: Sequence[Tensor]) -> list[Any]:
+    """Leaves of `_with_blanks` with tensors in the blanks."""
     new = iter(tensors)
-    return [next(new) if isinstance(leaf, (Tensor, tuple)) else leaf for leaf in leaves]
+    return [next(new) if leaf is Tensor else leaf for leaf in leaves]
 
 
 class Compiled:
