@@ -157,6 +157,25 @@ def test_the_command_goes_on_where_it_stopped(tmp_path, capsys, monkeypatch):
     assert re.search(r"out: expected a new directory.*trainer\.updates=30", capsys.readouterr().err)
 
 
+def test_the_table_and_the_figure_have_all_runs_of_the_folder(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    drawn: list = []
+    monkeypatch.setattr(
+        "pirl_rl.commands.suite.draw_suite", lambda scores: (drawn.append(scores), draw_suite(scores))[1]
+    )
+    other = ["problems=[reach1d]", *SMALL[1:]]
+    for arguments in ([*SMALL, "seeds=[10]"], [*SMALL, "seeds=[9]"], [*other, "seeds=[1]"], [*other, "rollouts=10"]):
+        main(arguments)
+    assert [{name: len(runs) for name, runs in scores.items()} for scores in drawn] == [
+        {"exit1d": 1},
+        {"exit1d": 2},
+        {"reach1d": 1, "exit1d": 2},
+        {"reach1d": 1},  # the only run with ten rollouts
+    ]
+    scores = [json.loads((tmp_path / f"runs/suite/exit1d/{seed}/score-50-20.json").read_text()) for seed in (9, 10)]
+    assert drawn[1]["exit1d"] == scores
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -3,7 +3,8 @@
     python -m pirl_rl.suite [problems=[NAME,...]] [seeds=[0,1,2]] [against=[grid,lqr,ppo,sac]] [out=DIR] [key=value ...]
 
 Trains each problem with each seed, measures the runs against the truth, and prints one table. What is done already in
-the folder `out` is not repeated, so that a suite that was stopped goes on.
+the folder `out` is not repeated, so that a suite that was stopped goes on. The table and the figure have all runs of
+the folder that were measured with as many states and rollouts, so that several commands can fill one folder.
 
     problems   names of problems; all by default
     seeds      seeds of the trainings, [0] by default
@@ -77,17 +78,17 @@ STATES_SEED = 30_000
 def main(arguments: Sequence[str]) -> None:
     with reported(Path()):
         options, overrides = _options(arguments)
-        folder, scores, sources, others = Path(options["out"]), {}, {}, {}
+        folder, others = Path(options["out"]), {}
         for name in options["problems"]:
             truth = _truth(folder / name, name, overrides, options["states"])
-            sources[name] = truth.source
-            scores[name] = [
+            own = [
                 _score(folder / name / str(seed), name, [*overrides, f"seed={seed}"], truth, options["rollouts"])
                 for seed in options["seeds"]
             ]
             others[name] = {
-                other: _alternative(folder / name, other, scores[name], truth, options) for other in options["against"]
+                other: _alternative(folder / name, other, own, truth, options) for other in options["against"]
             }
+            scores, sources = _measured(folder, options)
             table = markdown(scores, sources, others)
             with replacing(folder / "suite.md") as file:
                 file.write(table + "\n")
@@ -131,7 +132,7 @@ def _options(arguments: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
 
 def _truth(folder: Path, name: str, overrides: Sequence[str], states: int) -> Truth:
     """The truth of a problem, from its file in the folder if it is there."""
-    path = folder / f"truth-{states}.pt"
+    path = _truth_file(folder, states)
     if path.is_file():
         return Truth(**torch.load(path, weights_only=True))
     problem = make_problem(compose("train", [*PROBLEMS[name], *overrides]))
@@ -143,9 +144,36 @@ def _truth(folder: Path, name: str, overrides: Sequence[str], states: int) -> Tr
     return truth
 
 
+def _truth_file(folder: Path, states: int) -> Path:
+    """The file with the truth of a problem."""
+    return folder / f"truth-{states}.pt"
+
+
+def _measured(folder: Path, options: dict[str, Any]) -> tuple[dict[str, list[Score]], dict[str, str]]:
+    """The scores of all runs in the folder, and where the truth of each problem comes from, by problem."""
+    scores, sources = {}, {}
+    for name in PROBLEMS:
+        known = _truth_file(folder / name, options["states"])
+        if not known.is_file():
+            continue
+        truth = Truth(**torch.load(known, weights_only=True))
+        file = _score_file(truth, options["rollouts"])
+        seeds = sorted(int(run.name) for run in (folder / name).glob("[0-9]*") if (run / file).is_file())
+        paths = [folder / name / str(seed) / file for seed in seeds]
+        if paths:
+            scores[name] = [Score(**json.loads(path.read_text(encoding="utf-8"))) for path in paths]
+            sources[name] = truth.source
+    return scores, sources
+
+
+def _score_file(truth: Truth, rollouts: int) -> str:
+    """The name of the file with the score of a run."""
+    return f"score-{len(truth.x)}-{rollouts}.json"
+
+
 def _score(folder: Path, name: str, overrides: Sequence[str], truth: Truth, rollouts: int) -> Score:
     """The score of a run in the folder, which is trained and measured first, as far as that is not done."""
-    path, run = folder / f"score-{len(truth.x)}-{rollouts}.json", RunDirectory(folder)
+    path, run = folder / _score_file(truth, rollouts), RunDirectory(folder)
     typed = [*PROBLEMS[name], *overrides]
     refuse_other_settings(run, typed, "out")
     if path.is_file():
