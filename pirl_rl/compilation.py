@@ -44,9 +44,9 @@ class Traced:
     """A function that is compiled from traces of its operations, one for each kind of arguments.
 
     The compiler reads the Python code of a function, and where `torch.func.vmap` maps it, that takes twenty times as
-    long as a trace. A trace has the operations of one call, so that nothing but the numbers in the given tensors may
-    differ in another call, or be asked for. `vmap` refuses to be asked, which makes this the right way for what it
-    maps.
+    long as a trace. A trace has the operations of one call. In another call only the numbers in the given tensors may
+    differ, and the function must decide nothing by them. `vmap` refuses functions that do, so that what it maps can be
+    traced.
 
     The results have no gradient; the function itself may contain `torch.autograd.grad`.
 
@@ -125,7 +125,7 @@ class Compiled:
         except Exception as error:
             if self._called is self.function or not is_compiler_failure(error):
                 raise
-            result = self.function(*args)  # an error of its own has no warning before it
+            result = self.function(*args)  # where the function itself is wrong, its error comes without a warning
             warnings.warn(f"{self.name} runs eagerly, which is slower: {reason_of(error)}", stacklevel=2)
             self._called = self.function
             return result

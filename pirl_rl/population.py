@@ -4,7 +4,7 @@ The members differ in their seeds, in their loss weights or in their learning ra
 environment, a replay buffer, optimisers, random numbers and a run directory of its own, so that its run equals the one
 that it would have alone, up to rounding. An update stacks the networks and the batches of all members along a leading
 axis, and `torch.func.vmap` maps the losses over that axis, so that they are compiled once and evaluated together. The
-members play one after another.
+members play one after another, by one compiled simulator and one compiled policy.
 
 On a GPU, where updates are recorded, they play together in one environment, see `pirl_rl.collectors.joint`. A run then
 equals the one alone in law only, since the members share the random numbers of the steps.
