@@ -4,6 +4,14 @@ A bridge crosses a smooth face g = 0 with the probability exp(-2 g0 g1 / (|sigma
 g0 and g1 are the levels at both ends, and sigma and grad g are taken at the start. This is exact for constant
 coefficients and a flat face (E. Gobet, Stochastic Processes and their Applications 87, 2000).
 
+A curved face is nearer or farther than its tangent says, and where a path goes closely past a set there may be none.
+So the level is looked at once more, at the zero of the tangent of the decisive face. On the way there it is the
+parabola g(t) = g0 (1 - t + b t^2), with t from 0 to 1 and b = g(1) / g0. With B = sqrt(1 - 4 b) and
+A = sqrt(1 - 4 b + 4 b g1 / g0) its first zero is at t = 2 / (1 + B), and it has the level g1 at the distance
+2 g1 / (g0 (A + B)) before that. In the exponent these two take the places of 1 and g1 / g0. For b >= 1/4 there is no
+zero, and the face is not crossed. Decisive is the nearest face where one is enough, and the farthest where all must be
+crossed, in units of the noise of their levels.
+
 Without the ends, the probability that a path crosses a face within a time is that of Brownian motion with drift, see
 `first_passage`.
 
@@ -14,14 +22,21 @@ level is positive then, see `enters_intersection`.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from pirl_rl.sigma import transposed_times
+from pirl_rl.sigma import times, transposed_times
 
 Constraints = Callable[[Tensor], Tensor]
 """Maps states (N, n) to the levels (N, k) of k faces."""
+
+Decisive = Literal["nearest", "farthest"]
+"""Which of several faces decides: the nearest for a union of sets, the farthest for an intersection."""
+
+LEAST_BEND = -2.0
+"""The smallest b: a face lies at least half as far away as its tangent says."""
 
 SMALLEST = 1e-12
 """The smallest product of both levels of a bridge, in units of its variance, with which a time of crossing is drawn."""
@@ -65,13 +80,16 @@ def passage_probability(constraints: Constraints, x: Tensor, moved: Tensor, sigm
         sigma: (N, n, w) at x.
         h: the time (N,), in s.
     """
-    level, after, variance = _bridge(constraints, x, moved, sigma, h)
+    level, after = constraints(x), constraints(moved)
+    variance = squared_noise(constraints, x, sigma, level.shape[-1]) * h[..., None]
     # In units of h, the drift is the way of the level, and the strength of the noise is its deviation after h.
     deviation = variance.sqrt().clamp(min=torch.finfo(x.dtype).tiny ** 0.5)
     return first_passage(torch.ones_like(level), level, level - after, deviation)
 
 
-def crossing_probability(constraints: Constraints, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor) -> Tensor:
+def crossing_probability(
+    constraints: Constraints, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor, decisive: Decisive
+) -> Tensor:
     """The probability (N, k) that bridges are inside of each of k faces at some time, 1 where one of the ends is.
 
     Args:
@@ -79,8 +97,9 @@ def crossing_probability(constraints: Constraints, x: Tensor, moved: Tensor, sig
         x, moved: both ends of the bridges (N, n).
         sigma: (N, n, w) at x.
         h: the time between the ends (N,), in s.
+        decisive: the face whose curvature counts.
     """
-    return _chance(*_bridge(constraints, x, moved, sigma, h))
+    return _chance(*_bridge(constraints, x, moved, sigma, h, decisive))
 
 
 def crosses_any(
@@ -97,7 +116,7 @@ def crosses_any(
         h: the time between the ends (N,), in s.
         uniform: uniform random numbers (N, k).
     """
-    return (uniform < _probability(*_bridge(constraints, x, moved, sigma, h))).any(-1)
+    return (uniform < _probability(*_bridge(constraints, x, moved, sigma, h, "nearest"))).any(-1)
 
 
 def enters_intersection(
@@ -122,7 +141,7 @@ def enters_intersection(
         uniform: uniform random numbers (R, N, k).
         normal: standard normal numbers (R, 2, N, k); with one constraint and one attempt they are not needed.
     """
-    level, after, variance = _bridge(constraints, x, moved, sigma, h)
+    level, after, variance = _bridge(constraints, x, moved, sigma, h, "farthest")
     if normal is None:
         return (uniform[0] < _chance(level, after, variance)).all(-1)
     entered = torch.zeros_like(level[..., 0], dtype=torch.bool)
@@ -162,10 +181,31 @@ def _crossing_time(before: Tensor, after: Tensor, variance: Tensor, uniform: Ten
     return a / (a + b).clamp(min=torch.finfo(a.dtype).tiny)
 
 
-def _bridge(constraints: Constraints, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor) -> tuple[Tensor, ...]:
-    """The levels (N, k) at both ends, and the variance (N, k) of the levels over the time h (N,)."""
+def _bridge(
+    constraints: Constraints, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor, decisive: Decisive
+) -> tuple[Tensor, ...]:
+    """The levels (N, k) at both ends, and their variance (N, k) over the time h (N,).
+
+    The variance of the decisive face is that with which its tangent has the chance of the curved face.
+    """
     before, after = constraints(x), constraints(moved)
-    return before, after, squared_noise(constraints, x, sigma, before.shape[-1]) * h[..., None]
+    rates = _rates(constraints, x, sigma, before.shape[-1])
+    squared = rates.square().sum(-1)
+    crossable = (before > 0) & (squared > 0)
+    to_tangent = torch.where(crossable, before / squared, 0.0)
+    distance = before * to_tangent
+    if decisive == "nearest":
+        face = torch.where(crossable, distance, torch.inf).argmin(-1, keepdim=True)
+    else:
+        face = torch.where(crossable, distance, -torch.inf).argmax(-1, keepdim=True)
+    way = times(sigma, (rates * to_tangent[..., None]).take_along_dim(face[..., None], -2).squeeze(-2))
+    bend = constraints(x - way).gather(-1, face) / before.gather(-1, face)
+    bend = torch.where(bend.isfinite() & crossable.gather(-1, face), bend, 0.0).clamp(min=LEAST_BEND)
+    root = (1 - 4 * bend).clamp(min=0)
+    at_end = (root + 4 * bend * (after.gather(-1, face) / before.gather(-1, face)).abs()).clamp(min=0).sqrt()
+    root = root.sqrt()
+    nearer = torch.where(root > 0, (1 + root) * (at_end + root) / 4, 0.0)
+    return before, after, squared * torch.ones_like(squared).scatter(-1, face, nearer) * h[..., None]
 
 
 def _probability(before: Tensor, after: Tensor, variance: Tensor) -> Tensor:
@@ -184,8 +224,13 @@ def squared_noise(constraints: Constraints, x: Tensor, sigma: Tensor, count: int
         sigma: (N, n, w) at x.
         count: the number k.
     """
+    return _rates(constraints, x, sigma, count).square().sum(-1)
+
+
+def _rates(constraints: Constraints, x: Tensor, sigma: Tensor, count: int) -> Tensor:
+    """sigma^T grad g (N, k, w) of `squared_noise`."""
     if sigma.shape[-1] <= count:
         along = [torch.func.jvp(constraints, (x,), (column,))[1] for column in sigma.unbind(-1)]
-        return torch.stack([rate**2 for rate in along]).sum(0)
+        return torch.stack(along, -1)
     slopes = [torch.func.grad(lambda y, i=i: constraints(y)[..., i].sum())(x) for i in range(count)]
-    return torch.stack([transposed_times(sigma, slope).square().sum(-1) for slope in slopes], -1)
+    return torch.stack([transposed_times(sigma, slope) for slope in slopes], -2)

@@ -81,6 +81,10 @@ class Box:
         # Each coordinate is contiguous in memory, because problems unbind states into coordinates.
         return torch.stack(columns).movedim(0, -1)
 
+    def within_period(self, function: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
+        """A function of points (*, n) that gives `function` at the points that `wrap` makes of them."""
+        return lambda x: function(self.wrap(x))
+
     def contains(self, x: Tensor) -> Tensor:
         """Whether points (*, n) lie in the closed box, (*) bool; every coordinate of a periodic axis does."""
         inside = self.normalize(x).abs() <= 1

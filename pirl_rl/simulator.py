@@ -232,9 +232,9 @@ class Simulator:
         kick = times(sigma, (noise * h.sqrt()).mT)
         moved = problem.states.wrap(x + problem.drift(x, u) * h[..., None] + kick)
         reached, failed = problem.reached(moved), problem.failed(moved)
-        path = (x, moved, sigma, h)
+        path, within = (x, moved, sigma, h), problem.states.within_period
         if target is not None:
-            reached = reached | enters_intersection(problem.reached_constraints, *path, target, corners)
+            reached = reached | enters_intersection(within(problem.reached_constraints), *path, target, corners)
         if avoid is not None:
-            failed = failed | crosses_any(problem.avoid_constraints, *path, avoid)
+            failed = failed | crosses_any(within(problem.avoid_constraints), *path, avoid)
         return moved, kick, reached, failed

@@ -166,11 +166,41 @@ def test_bridges_with_random_ends_cross_with_the_probability_of_a_first_passage(
     quantiles = (torch.arange(20_001, dtype=torch.float64) + 0.5) / 20_001
     moved = a + v * h + s * h**0.5 * torch.special.ndtri(quantiles)[:, None]
     sigma, time = torch.full((20_001, 1, 1), s, dtype=torch.float64), torch.full((20_001,), h, dtype=torch.float64)
-    crossed = crossing_probability(lambda y: y, torch.full_like(moved, a), moved, sigma, time)
+    crossed = crossing_probability(lambda y: y, torch.full_like(moved, a), moved, sigma, time, "nearest")
     passage = first_passage(*torch.tensor([h, a, -v, s], dtype=torch.float64))
     torch.testing.assert_close(crossed.mean(), passage, rtol=0, atol=1e-4)
-    without_noise = crossing_probability(lambda y: y, moved.abs() + 1, moved.abs() + 2, sigma * 0, time)
+    without_noise = crossing_probability(lambda y: y, moved.abs() + 1, moved.abs() + 2, sigma * 0, time, "nearest")
     assert (without_noise == 0).all()
+
+
+def test_a_path_goes_past_a_set_that_it_cannot_touch():
+    """The level x^2 + c is above 0 everywhere, and c is far below its change in a step."""
+    rng, c = torch.Generator().manual_seed(0), 1e-4
+    x = torch.linspace(0.02, 0.1, 50, dtype=torch.float64).repeat(200)[:, None]
+    moved = x + 0.05 * torch.randn(x.shape, generator=rng, dtype=torch.float64)
+    sigma, time = torch.full((len(x), 1, 1), 0.05, dtype=torch.float64), torch.ones(len(x), dtype=torch.float64)
+    for decisive in ("nearest", "farthest"):
+        crossed = crossing_probability(lambda y: y.square() + c, x, moved, sigma, time, decisive)
+        assert (crossed == 0).all()
+
+
+@pytest.mark.parametrize("faces", [1, 2])
+@pytest.mark.parametrize(("power", "tolerance"), [(0.5, 0.02), (2.0, 1e-12), (3.0, 0.02)])
+def test_a_curved_level_is_crossed_like_the_distance(power, tolerance, faces):
+    """The levels (1 + d)^p - 1 are 0 where the distance d is, and parabolas for p = 2. Tangents alone are wrong by 0.07
+    to 0.25."""
+    rng = torch.Generator().manual_seed(0)
+    x = 0.3 * torch.rand(2_000, 1, generator=rng, dtype=torch.float64) + 0.01
+    moved = (x + 0.2 * torch.randn(x.shape, generator=rng, dtype=torch.float64)).abs()
+    sigma, time = torch.full((len(x), 1, 1), 0.2, dtype=torch.float64), torch.ones(len(x), dtype=torch.float64)
+
+    def levels(d: Tensor) -> Tensor:
+        bent = (1 + d).clamp(min=1e-6) ** power - 1
+        return torch.cat([bent, d + 9], -1)[:, :faces]
+
+    expected = (-2 * x * moved / 0.2**2).exp()
+    crossed = crossing_probability(levels, x, moved, sigma, time, "nearest")[:, :1]
+    torch.testing.assert_close(crossed, expected, rtol=0, atol=tolerance)
 
 
 def test_a_path_leaves_a_wall_with_its_exact_probability():

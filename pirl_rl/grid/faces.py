@@ -108,10 +108,12 @@ def _step(problem: ReachAvoidProblem, spacing: Tensor, policy: Function, tau: Te
     half = x + drift * (h / 2).unsqueeze(-1)
     moved = x + problem.drift(half, u) * h.unsqueeze(-1) + times(sigma, normal) * h.sqrt().unsqueeze(-1)
     moved, reached, failed = problem.states.wrap(moved), torch.zeros_like(h), torch.zeros_like(h)
+    path, within = (x, moved, sigma, h), problem.states.within_period
     if problem.has_avoid_set:
         # One constraint of B suffices, and all of A must hold. The noise of different faces is taken as independent.
-        failed = 1 - (1 - crossing_probability(problem.avoid_constraints, x, moved, sigma, h)).prod(-1)
+        crossed = crossing_probability(within(problem.avoid_constraints), *path, "nearest")
+        failed = 1 - (1 - crossed).prod(-1)
     if problem.objective == "reach-avoid":
-        crossed = crossing_probability(problem.reached_constraints, x, moved, sigma, h).prod(-1)
-        reached = (1 - failed) * crossed
+        crossed = crossing_probability(within(problem.reached_constraints), *path, "farthest")
+        reached = (1 - failed) * crossed.prod(-1)
     return moved, h, reached, failed
