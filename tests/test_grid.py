@@ -475,6 +475,47 @@ def test_drift_and_noise_act_in_turns_where_the_noise_is_weak(problem, split):
     assert GridSolver(problem, points=11, estimate=False).solve().split == split
 
 
+class Conveyor(ReachAvoidProblem):
+    """The first state must come to 1 before the second leaves (-1, 1), whose noise grows with the speed of the first.
+
+    On a way of the length d at the speed u the noise has the variance (0.2 + 0.1 / u) d. So the full speed, 1, is best,
+    and V is the probability that Brownian motion stays in (-1, 1) for this variance if d <= tau, else 0.
+    """
+
+    horizon = 1.0
+    states, controls = Box([0.0, -1.1], [1.1, 1.1]), Box([0.5], [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.cat([u, torch.zeros_like(u)], -1)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.stack([torch.zeros_like(u), (0.2 * u + 0.1).sqrt()], -2)
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return torch.cat([1 - x[..., :1], x[..., 1:].abs() - 1], -1)
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        return 1 - x[..., 1:].abs()
+
+    def exact_value(self, tau: Tensor, x: Tensor) -> Tensor:
+        way, side = 1 - x[..., 0], x[..., 1:]
+        order = torch.arange(1, 80, 2, dtype=x.dtype) * math.pi
+        terms = 4 / order * torch.sin(order * (side + 1) / 2) * torch.exp(-(order**2) * 0.3 * way.unsqueeze(-1) / 8)
+        return torch.where(way <= tau, terms.sum(-1), 0.0)
+
+
+def test_noise_that_depends_on_the_control_acts_in_turns_with_the_drift():
+    """V jumps where the way is tau. If both act together it is smeared, and wrong by up to 0.34 at these states."""
+    problem = Conveyor()
+    solution = GridSolver(problem, 61, estimate=False).solve()
+    tau, x = points(problem)
+    away = (1 - x[:, 0] - tau).abs() > 0.05
+    error = (solution.value(tau, x) - problem.exact_value(tau, x)).abs()[away]
+    assert error.mean() < 0.004
+    assert error.max() < 0.03
+    assert (solution.policy(tau, x)[away & (1 - x[:, 0] < tau), 0] == 1).double().mean() > 0.95
+
+
 @pytest.fixture(scope="module")
 def dubins() -> GridSolution:
     return GridSolver(DubinsCar(), points=41, estimate=False).solve()

@@ -92,6 +92,7 @@ class Chain:
 
     Attributes:
         axes: forward and backward arms along each axis.
+        shared: whether all candidates have the same chain: that of noise which does not depend on the control.
     """
 
     def __init__(
@@ -103,11 +104,13 @@ class Chain:
         self._unknown[free] = np.arange(len(free))
         self.axes = [(self._arm(offset), self._arm(-offset)) for offset in np.eye(len(mesh.shape), dtype=int)]
         x = torch.from_numpy(mesh.states(self._at))
+        controlled = has_controlled_noise(problem)
+        self.shared = not (moves or controlled)
         noise, blocks, gains = None, [], []
-        for u in controls:
+        for u in controls[:1] if self.shared else controls:
             control = torch.from_numpy(np.ascontiguousarray(u))
             drift = problem.drift(x, control).numpy() * (moves / mesh.spacing)
-            if noise is None or has_controlled_noise(problem):
+            if noise is None or controlled:
                 noise = self._noise(problem.diffusion(x, control).numpy())
             rates, gain = self._assembled(drift, noise)
             blocks.append(rates)
@@ -116,7 +119,7 @@ class Chain:
         self._gains = np.concatenate(gains)
 
     def generator(self, value: np.ndarray) -> np.ndarray:
-        """The generator of every candidate (K, M), in 1/s, of V (M,) at the nodes."""
+        """The generator of every candidate (K, M), or of the shared chain (1, M), in 1/s, of V (M,) at the nodes."""
         return (self._rates @ value + self._gains).reshape(-1, len(value))
 
     def of(self, policy: np.ndarray) -> tuple[sparse.csr_array, np.ndarray]:
@@ -125,6 +128,8 @@ class Chain:
         Returns:
             Rates (M, M) and gain (M,), both in 1/s: the generator of V is rates @ V + gain.
         """
+        if self.shared:
+            return self._rates, self._gains
         rows = policy * len(policy) + np.arange(len(policy))
         return self._rates[rows], self._gains[rows]
 

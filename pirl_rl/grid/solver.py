@@ -39,6 +39,13 @@ TOLERANCE = 1e-7
 ITERATIONS = 50
 """The largest number of policy iterations in a step; two or three are usual."""
 
+TURNS = 3
+"""The number of policy iterations in a step in which drift and noise act in turns: the next step goes on from there."""
+
+GAIN = 1e-6
+"""Where drift and noise act in turns: the gain of V for which a node gives up the candidate that it had one step
+before. V itself is known to `TOLERANCE`."""
+
 LEAST_FRACTION = 0.05
 """V is continued into A and B along arms at least this long, as the slope along shorter ones is mostly rounding."""
 
@@ -119,7 +126,7 @@ class GridSolver:
         free = np.flatnonzero(~inside)
         controls = candidates(problem, nodes[free], mesh.spacing, self.levels)
         steps, split = self._scheme(mesh, nodes[free], controls) if scheme is None else scheme
-        chain = Chain(problem, mesh, free, controls[:1] if split else controls, moves=not split)
+        chain = Chain(problem, mesh, free, controls, moves=not split)
         value = problem.boundary_value(torch.from_numpy(nodes[free])).numpy()
         if not (value.any() or any(arm.value.any() for pair in chain.axes for arm in pair)):
             raise ArgumentError(f"points: expected a mesh that meets the target, got none of its nodes with {points}")
@@ -180,8 +187,8 @@ def _in_turns(
     after, policy, times = continued(value), np.zeros(len(value), int), steps * np.linspace(0, 1, steps + 1) ** 2
     for step in range(steps):
         before = after
-        moved, policy = transport(after, policy)
-        value = _solve(chain, moved, moved, np.zeros_like(policy), horizon / steps)
+        policy, moved = _turn(chain, transport, after, policy, horizon / steps)
+        value = _solve(chain, moved, moved, policy, horizon / steps)
         if step < first:
             held, best = transport.first(step + 1)
             value, policy = np.where(noisy, held, value), np.where(noisy, best, policy)
@@ -189,6 +196,28 @@ def _in_turns(
         within = times - step
         for level in np.flatnonzero((within > 0) & (within <= 1)):
             yield int(level), (1 - within[level]) * before + within[level] * after, policy
+
+
+def _turn(
+    chain: Chain, transport: Transport, field: np.ndarray, policy: np.ndarray, dt: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The best policy (M,) of a step in turns from V (N,) at all nodes, and V (M,) at the ends of its paths.
+
+    Where candidates are equally good a node keeps the one of `policy` (M,), with which V rose there.
+    """
+    seen, nodes = transport.seen(field), np.arange(len(policy))
+    if chain.shared:
+        best = seen.argmax(0)
+        value = transport.moved(field, best, policy).max(0)
+        return np.where(seen[best, nodes] > seen[policy, nodes] + GAIN, best, policy), value
+    value = seen[policy, nodes]
+    for turn in range(TURNS):
+        if turn:
+            value = _solve(chain, seen[policy, nodes], value, policy, dt)
+        scores = seen + dt * chain.generator(value)
+        best = scores.argmax(0)
+        policy = np.where(scores[best, nodes] > scores[policy, nodes] + GAIN, best, policy)
+    return policy, transport.moved(field, policy)[0]
 
 
 def _advance(chain: Chain, before: np.ndarray, policy: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:

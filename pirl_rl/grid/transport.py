@@ -11,6 +11,12 @@ Equations, SIAM, 2013), where a path that enters A or B on its way has their val
 by the chain without drift. Between nodes V is a cubic spline that is limited to the values at the corners of the cell
 (R. Bermejo and A. Staniforth, Monthly Weather Review 120, 1992), so that it stays in [0, 1].
 
+Where sigma depends on u, the control of a step must be the best one for both of its parts. A node that plays u has
+
+    V(x) - dt L_u V(x) = W_u(x),   W_u(x) = V(tau, x(dt; u)),
+
+with the generator L_u of the noise alone, and the best u follows by policy iteration.
+
 At tau = 0 V jumps at the faces, and in the short time sigma^2 / |f|^2 the noise makes layers there that are thinner
 than a cell. A path that the flow leads to a face has crossed it earlier, on average, than at its end alone, and V keeps
 this lead for good. So in the first steps V is the probability of crossing the faces while a control is held, see
@@ -43,21 +49,19 @@ LOOKS = 2
 BLUR = 1.0
 """The standard deviation, in cells, of the filter through which candidates see V."""
 
-GAIN = 1e-6
-"""The gain of V for which a node gives up the candidate that it had one step before; V itself is known to 1e-7."""
-
 
 def is_weak(problem: ReachAvoidProblem, mesh: Mesh, x: np.ndarray, controls: np.ndarray) -> bool:
     """Whether the noise is weak beside the mesh at most of the nodes x (M, n), with controls (K, M, m).
 
-    Noise that depends on the control cannot act in a turn of its own, and counts as strong.
+    Where the noise depends on the control, its largest variance is compared with the largest drift.
     """
-    if has_controlled_noise(problem):
-        return False
-    points, control = torch.from_numpy(x), torch.from_numpy(np.ascontiguousarray(controls[0]))
-    variance = (problem.diffusion(points, control).numpy() / mesh.spacing[:, None]) ** 2
-    drift = np.abs(problem.drift(points, control).numpy() / mesh.spacing)
-    return bool(((drift > WEAK * variance.sum(-1)).any(-1)).mean() > 0.5)
+    points, variance, drift = torch.from_numpy(x), np.zeros_like(x), np.zeros_like(x)
+    for u in controls if has_controlled_noise(problem) else controls[:1]:
+        control = torch.from_numpy(np.ascontiguousarray(u))
+        sigma = problem.diffusion(points, control).numpy() / mesh.spacing[:, None]
+        variance = np.maximum(variance, (sigma**2).sum(-1))
+        drift = np.maximum(drift, np.abs(problem.drift(points, control).numpy() / mesh.spacing))
+    return bool((drift > WEAK * variance).any(-1).mean() > 0.5)
 
 
 def speed_limit(problem: ReachAvoidProblem, mesh: Mesh, x: np.ndarray, controls: np.ndarray) -> float:
@@ -102,49 +106,39 @@ class Transport:
 
     def noise_acts_on_faces(self) -> np.ndarray:
         """Whether the noise moves every level of A that is above 0, or the level of B for invariance, (M,) bool."""
-        problem, x = self._problem, self._x
-        sigma = problem.diffusion(x, self._controls[0])
-        if problem.objective != "reach-avoid":
-            return (squared_noise(lambda y: problem.avoid_level(y).unsqueeze(-1), x, sigma, 1)[:, 0] > 0).numpy()
-        levels = problem.target_constraints(x)
-        moved = squared_noise(problem.target_constraints, x, sigma, levels.shape[-1]) > 0
-        return (moved | (levels <= 0)).all(-1).numpy()
+        tried = self._controls if has_controlled_noise(self._problem) else self._controls[:1]
+        return np.all([_noise_acts_on_faces(self._problem, self._x, u) for u in tried], axis=0)
 
-    def __call__(self, field: np.ndarray, policy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """V one step further, and its policy.
+    def seen(self, field: np.ndarray) -> np.ndarray:
+        """What each candidate is worth (K, M), judged by a V that is blurred over a cell.
 
         With weak noise V is 1 in whole regions, whatever the next control is, until a path comes to the edge of the
-        region, where the right control must be exact. So candidates are compared by a V that is blurred over a cell,
-        which shows the edge before, and where they are equal a node keeps the control with which V rose there. V
-        itself is that of the best candidate or of the one that the node had, where that is larger.
+        region, where the right control must be exact. A blurred V shows the edge before.
 
         Args:
             field: V (N,) at all nodes, continued into A and B.
-            policy: the numbers (M,) of the best candidates at a time to go that is one step shorter.
+        """
+        blurred, seen = gaussian_filter(self._padded(field), BLUR, mode="nearest"), []
+        for place, ended, end in self._feet:
+            seen.append(np.where(ended, end, map_coordinates(blurred, place, order=1, prefilter=False, mode="nearest")))
+        return np.stack(seen)
 
-        Returns:
-            W (M,), and the numbers (M,) of the best candidates.
+    def moved(self, field: np.ndarray, *policies: np.ndarray) -> np.ndarray:
+        """V (k, M) at the ends of the paths of k policies, each given as the numbers (M,) of candidates.
+
+        Args:
+            field: V (N,) at all nodes, continued into A and B.
+            policies: the numbers of the candidates.
         """
         padded = self._padded(field)
-        blurred = gaussian_filter(padded, BLUR, mode="nearest")
-        best, seen, kept = policy, np.full(len(policy), -np.inf), np.zeros(len(policy))
-        for number, (place, ended, end) in enumerate(self._feet):
-            vague = np.where(ended, end, map_coordinates(blurred, place, order=1, prefilter=False, mode="nearest"))
-            kept = np.where(policy == number, vague, kept)
-            best, seen = np.where(vague > seen, number, best), np.maximum(vague, seen)
-        value = self._moved(padded, [best, policy]).max(0)
-        return value, np.where(seen > kept + GAIN, best, policy)
-
-    def _moved(self, padded: np.ndarray, choices: list[np.ndarray]) -> np.ndarray:
-        """V (k, M) at the ends of the paths of k choices of a candidate (M,) for each node."""
         spline = spline_filter(padded, order=3, mode="mirror")
         # The smallest and the largest value at the corners of each cell, noted at its first corner.
         low, high = (extreme(padded, size=2, origin=-1) for extreme in (minimum_filter, maximum_filter))
         values = []
-        for choice in choices:
-            place, stopped = np.empty((padded.ndim, len(choice))), np.full(len(choice), np.nan)
+        for policy in policies:
+            place, stopped = np.empty((padded.ndim, len(policy))), np.full(len(policy), np.nan)
             for number, (foot, ended, end) in enumerate(self._feet):
-                chosen = choice == number
+                chosen = policy == number
                 place[:, chosen] = foot[:, chosen]
                 stopped[chosen & ended] = end[chosen & ended]
             cell = tuple(np.floor(place).astype(int))
@@ -159,6 +153,16 @@ class Transport:
             width[axis] = (PADDING, PADDING)
             field = np.pad(field, width, mode="wrap" if axis in self._mesh.periodic else "edge")
         return field
+
+
+def _noise_acts_on_faces(problem: ReachAvoidProblem, x: torch.Tensor, u: torch.Tensor) -> np.ndarray:
+    """`Transport.noise_acts_on_faces` for the control u (M, m) at x (M, n)."""
+    sigma = problem.diffusion(x, u)
+    if problem.objective != "reach-avoid":
+        return (squared_noise(lambda y: problem.avoid_level(y).unsqueeze(-1), x, sigma, 1)[:, 0] > 0).numpy()
+    levels = problem.target_constraints(x)
+    moved = squared_noise(problem.target_constraints, x, sigma, levels.shape[-1]) > 0
+    return (moved | (levels <= 0)).all(-1).numpy()
 
 
 def _flow(problem: ReachAvoidProblem, mesh: Mesh, x: torch.Tensor, u: torch.Tensor, dt: float):
