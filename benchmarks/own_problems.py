@@ -7,7 +7,8 @@ levels, the networks and the rules of where episodes start, Gusty, Investor, Loi
 those of the inertia of `BestControl`, Gusty and Investor in that of its budget, and TwoHarbours, Bicycle, Sprint and
 Investor in the rules of `pirl_rl.switching`; the others in none. V and the success of the learned policy are compared
 with the grid, in the way of the suite, at 400 states with 1,000 paths from each. With three states and two controls
-there is no truth. A run takes minutes; a finished one is loaded, so that other settings need another folder.
+there is no truth, and Bearing and Mirror are compared with the products of the grids of their independent subsystems. A
+run takes minutes; a finished one is loaded, so that other settings need another folder.
 """
 
 from __future__ import annotations
@@ -17,12 +18,16 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
+import torch
 import yaml
 
 import pirl_rl
-from benchmarks.kinds import PROBLEMS
+from benchmarks.kinds import PROBLEMS, Mixture
 from benchmarks.record import save
-from pirl_rl.scoring import Score, find_truth, markdown, measure
+from pirl_rl.grid import GridSolver
+from pirl_rl.sampling.initial_states import sample_interior
+from pirl_rl.scoring import Score, Truth, find_truth, markdown, measure
+from pirl_rl.scoring.truth import EARLIEST
 
 POINTS = {1: 801, 2: 161, 3: 81}
 """The nodes of the grid along each axis, by the number of states."""
@@ -33,10 +38,23 @@ STATES_SEED = 31_000
 """The seed of the states at which runs are measured; no training uses it."""
 
 
+def product(problem: Mixture) -> Truth:
+    """The reference values of independent subsystems: the products of those that the grid has for each of them."""
+    rng = torch.Generator().manual_seed(STATES_SEED)
+    x = sample_interior(problem, problem.states, STATES, rng, torch.float64)
+    tau = problem.horizon * (EARLIEST + (1 - EARLIEST) * torch.rand(len(x), generator=rng, dtype=x.dtype))
+    value, error = torch.ones_like(tau), 0.0
+    for part, z in problem.split(x):
+        # Everything that stays within the bounds of a subsystem lies in its box.
+        grid = GridSolver(part, POINTS[part.states.dim], margin=[0.0] * part.states.dim).solve()
+        value, error = value * grid.value(tau, z), error + float(grid.error(tau, z).mean())
+    return Truth(tau, x, value, "grid", error)
+
+
 def measured(name: str, seed: int, out: Path, settings: dict) -> Score:
     """Train a problem, or load its finished run, and compare it with the grid."""
     problem, folder = PROBLEMS[name](), out / f"{name}-{seed}"
-    truth = find_truth(problem, STATES, STATES_SEED, POINTS)
+    truth = product(problem) if isinstance(problem, Mixture) else find_truth(problem, STATES, STATES_SEED, POINTS)
     if not (folder / "summary.json").exists():
         pirl_rl.train(problem, folder=folder, seed=seed, report=False, **{"evaluation.during": []}, **settings)
     run = pirl_rl.load_run(folder, problem=problem)

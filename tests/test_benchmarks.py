@@ -7,11 +7,17 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
+from torch import Tensor
 
 from benchmarks import __main__ as command
 from benchmarks import dimension, ratios, time_to_accuracy
+from benchmarks.kinds import PROBLEMS
 from benchmarks.ratios import WORSE, compare, table
+from pirl_rl.evaluation.monte_carlo import monte_carlo
+from pirl_rl.grid import GridSolver
 from pirl_rl.layers import Dense
+from pirl_rl.sampling.initial_states import sample_interior
 
 FAKE = """
 import json, sys
@@ -168,3 +174,21 @@ def test_the_table_has_both_clocks_and_leaves_out_what_is_not_reached():
     assert line == "| reach1d | 1.0e-03 | 1 of 2 | 100 | 21.0 (10.5) | 6.0 (2.5) | 0.20 (0.10) |"
     line = time_to_accuracy.show({**found, "medians": None, "grid": None})
     assert line == "| reach1d | 1.0e-03 | 1 of 2 |  |  |  |  |"
+
+
+def test_a_mixture_succeeds_with_the_product_of_the_probabilities_of_its_parts():
+    problem, rollouts = PROBLEMS["Bearing"](), 400
+    x = sample_interior(problem, problem.states, 25, torch.Generator().manual_seed(0), torch.float64)
+    tau = torch.full((25,), problem.horizon / 3, dtype=torch.float64)
+    clock = {"rollouts": rollouts, "dt": problem.horizon / 200}
+    parts = [(part, GridSolver(part, 31, margin=[0.0, 0.0], estimate=False).solve(), z) for part, z in problem.split(x)]
+
+    def policy(tau: Tensor, x: Tensor) -> Tensor:
+        pairs = zip(parts, problem.split(x), strict=True)
+        return torch.cat([grid.policy(tau, z) for (_, grid, _), (_, z) in pairs], -1)
+
+    together = monte_carlo(problem, policy, tau, x, **clock).probability
+    apart = [monte_carlo(part, grid.policy, tau, z, **clock).probability for part, grid, z in parts]
+    assert 0.3 < together.mean() < 0.9
+    error = torch.stack([p * (1 - p) for p in (together, *apart)]).sum().div(rollouts).sqrt() / len(x)
+    assert (together - apart[0] * apart[1]).mean().abs() <= 3 * error

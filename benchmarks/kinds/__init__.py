@@ -2,12 +2,18 @@
 
 from benchmarks.kinds.cycles import JetLag, PowerSwing, Runaway, Searchlight
 from benchmarks.kinds.masses import Crosswind, Gusty, Lander, Orbit, Servo, Sprint, VanDerPol
+from benchmarks.kinds.mixtures import Bearing, Mirror, Mixture
+from benchmarks.kinds.passages import SlotChange, TwoLink
 from benchmarks.kinds.plants import Epidemic, Investor, Reservoir, Toggle, Tokens, TwoTanks
+from benchmarks.kinds.stores import FastCharge, Ferment, Forager
 from benchmarks.kinds.vehicles import Bicycle, Evader, Loiter, Ring, River, Slalom, Steering, TwoCars, TwoHarbours
 from pirl_rl import ReachAvoidProblem
 
+__all__ = ["KINDS", "PROBLEMS", "Mixture"]
+
 KINDS: tuple[type[ReachAvoidProblem], ...] = (Servo, Steering, Evader, Gusty, TwoTanks, Reservoir, Slalom, Orbit, Ring)
 KINDS += (VanDerPol, TwoHarbours, River, Loiter, Crosswind, Bicycle, Tokens, Lander, Epidemic, Toggle, TwoCars, Sprint)
-KINDS += (Investor, Runaway, JetLag, Searchlight, PowerSwing)
+KINDS += (Investor, Runaway, JetLag, Searchlight, PowerSwing, Forager, Ferment, FastCharge, SlotChange, TwoLink)
+KINDS += (Bearing, Mirror)
 
 PROBLEMS = {kind.__name__: kind for kind in KINDS}

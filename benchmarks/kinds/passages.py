@@ -1,0 +1,88 @@
+"""A satellite and an arm, which pass obstacles on either side."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from benchmarks.kinds.shapes import rows
+from pirl_rl import Box, ReachAvoidProblem
+
+
+class SlotChange(ReachAvoidProblem):
+    """Move a geostationary satellite to one of two free slots past four others, which it must not go by slowly.
+
+    The states are the longitude in degrees (periodic) and its drift in degrees per day. The quicker the drift, the
+    farther is the orbit from theirs.
+    """
+
+    horizon = 32.0
+    states, controls = Box([-180.0, -5.0], [180.0, 5.0], periodic=[0]), Box([-0.35], [0.35])
+    slots = (25.0, -125.0)
+    others = ((-45.0, 12.0), (65.0, 9.0), (125.0, 14.0), (5.0, 6.0))  # longitude and half width
+
+    def angle(self, x: Tensor, at: float) -> Tensor:
+        return (torch.remainder(x[..., 0] - at + 180, 360) - 180).abs()
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        earth = -0.00168 * torch.sin(2 * (x[..., 0] - 75.1) * math.pi / 180)  # its equator is no circle
+        return rows(x[..., 1], earth + u[..., 0])
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return x.new_tensor([[0.0], [0.3]]).expand(*x.shape, 1)
+
+    def target_level(self, x: Tensor) -> Tensor:
+        near = torch.minimum(*(self.angle(x, at) for at in self.slots))
+        return torch.maximum(near / 4 - 1, x[..., 1].abs() / 0.5 - 1)
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        slow = x[..., 1].abs() / 0.9 - 1
+        close = [torch.maximum(self.angle(x, at) / width - 1, slow) for at, width in self.others]
+        return torch.stack([*close, 5.5 - x[..., 1].abs()], -1).amin(-1)
+
+
+class TwoLink(ReachAvoidProblem):
+    """Bring the hand of an arm with two links to one of two bins past three posts, which no link may touch; rad and s.
+
+    A cable limits the turn of the shoulder on either side. The hand comes to most places with the elbow on either side,
+    and the elbow passes one of the posts at 2 mm.
+    """
+
+    horizon = 2.5
+    states, controls = Box([-2.9, -2.6], [2.9, 2.6]), Box([-1.0, -1.4], [1.0, 1.4])
+    links = (1.0, 0.8)
+    posts = ((0.9, 0.75, 0.16), (-0.35, -1.15, 0.2), (-1.25, 0.5, 0.15))
+    bins = ((0.1, 1.45, 0.22), (0.6, -1.1, 0.16))
+
+    def joints(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        shoulder, both = x[..., 0], x[..., 0] + x[..., 1]
+        elbow = self.links[0] * rows(shoulder.cos(), shoulder.sin())
+        return elbow, elbow + self.links[1] * rows(both.cos(), both.sin())
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        sag = -0.15 * torch.cos(x[..., 0])
+        return rows(u[..., 0] + sag, u[..., 1])
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        zero = torch.zeros_like(x[..., 0])
+        whip = 0.25 + 0.12 * (1 + x[..., 1].cos())  # a stretched arm shakes more
+        return torch.stack([rows(whip, zero), rows(-0.3 * whip, zero + 0.45)], -1)
+
+    def target_level(self, x: Tensor) -> Tensor:
+        _, hand = self.joints(x)
+        gaps = [(hand - hand.new_tensor([a, b])).norm(dim=-1) - r for a, b, r in self.bins]
+        return torch.maximum(torch.stack(gaps, -1).amin(-1), -self.avoid_level(x))
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        elbow, hand = self.joints(x)
+        gaps = [2.8 - x[..., 0].abs(), 2.5 - x[..., 1].abs()]
+        for a, b, r in self.posts:
+            post = x.new_tensor([a, b])
+            for start, end in ((torch.zeros_like(elbow), elbow), (elbow, hand)):
+                along = end - start
+                share = ((post - start) * along).sum(-1) / along.square().sum(-1)
+                nearest = start + share.clamp(0, 1).unsqueeze(-1) * along
+                gaps.append((post - nearest).square().sum(-1).clamp(min=1e-12).sqrt() - r)
+        return torch.stack(gaps, -1).amin(-1)
