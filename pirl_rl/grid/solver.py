@@ -1,24 +1,18 @@
-"""The solver: implicit Euler steps in tau, each solved by policy iteration (R. Howard 1960).
-
-A step from V' to V solves V - dt max_u {rates(u) V + gain(u)} = V', and an error r of this equation is an error of at
-most |r| in V, because the scheme is monotone. The steps are equidistant in sqrt(tau), since V changes fastest where
-tau is small.
-"""
+"""The solver: V and the policy of a problem on a mesh, by the steps of `pirl_rl.grid.march`."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
-from scipy import sparse
 from scipy.ndimage import distance_transform_edt
-from scipy.sparse.linalg import LinearOperator, bicgstab, spsolve
 
 from pirl_rl.errors import ArgumentError
 from pirl_rl.grid.candidates import candidates
 from pirl_rl.grid.chain import Chain
+from pirl_rl.grid.march import Continuation, March
 from pirl_rl.grid.mesh import Mesh, absorbed, default_margin, make_mesh
 from pirl_rl.grid.solution import GridSolution
 from pirl_rl.grid.transport import FARTHEST, Transport, is_weak, speed_limit
@@ -32,26 +26,6 @@ MOST_STEPS = 6
 
 FIRST = 2.0
 """The number of cells through which a control is held from tau = 0, where drift and noise act in turns."""
-
-TOLERANCE = 1e-7
-"""The largest error of the equation of one step."""
-
-ITERATIONS = 50
-"""The largest number of policy iterations in a step; two or three are usual."""
-
-TURNS = 3
-"""The number of policy iterations in a step in which drift and noise act in turns: the next step goes on from there."""
-
-GAIN = 1e-6
-"""Where drift and noise act in turns: the gain of V for which a node gives up the candidate that it had one step
-before. V itself is known to `TOLERANCE`."""
-
-LEAST_FRACTION = 0.05
-"""V is continued into A and B along arms at least this long, as the slope along shorter ones is mostly rounding."""
-
-
-Level = tuple[int, np.ndarray, np.ndarray]
-"""The number of a time to go, V (N,) at all nodes, and the numbers (M,) of the best candidates."""
 
 
 class GridSolver:
@@ -130,19 +104,20 @@ class GridSolver:
         value = problem.boundary_value(torch.from_numpy(nodes[free])).numpy()
         if not (value.any() or any(arm.value.any() for pair in chain.axes for arm in pair)):
             raise ArgumentError(f"points: expected a mesh that meets the target, got none of its nodes with {points}")
-        continued = _Continuation(mesh, free, fixed, chain, bounded=split)
+        continued = Continuation(mesh, free, fixed, chain, bounded=split)
         values = np.empty((steps + 1, mesh.size), np.float32)
         policies = np.empty((steps + 1, len(free)), np.min_scalar_type(len(controls)))
         values[0] = continued(value)
+        march = March(chain, continued, problem.horizon, steps)
         if split:
             transport = Transport(problem, mesh, nodes[free], controls, problem.horizon / steps)
             speed = speed_limit(problem, mesh, nodes[free], controls)
             # A smoothed payoff does not jump at tau = 0.
             first = 0 if problem.payoff.epsilon else math.ceil(FIRST * steps / (problem.horizon * speed))
-            march = _in_turns(chain, transport, continued, value, problem.horizon, steps, first)
+            levels = march.in_turns(value, transport, first)
         else:
-            march = _together(chain, continued, value, problem.horizon, steps)
-        for level, field, policy in march:
+            levels = march.together(value)
+        for level, field, policy in levels:
             values[level], policies[level] = field, policy
         policies[0] = policies[1]
         place = np.full(mesh.size, -1)
@@ -159,114 +134,3 @@ class GridSolver:
         needed = math.ceil(self.problem.horizon * speed_limit(self.problem, mesh, x, controls) / FARTHEST)
         most = MOST_STEPS * steps if self.steps is None else steps
         return (max(steps, needed), True) if needed <= most else (steps, False)
-
-
-def _together(chain: Chain, continued: _Continuation, value: np.ndarray, horizon: float, steps: int) -> Iterator[Level]:
-    """Steps in which drift and noise act at once, from V (M,) at tau = 0: equal ones in sqrt(tau)."""
-    policy = np.zeros(len(value), int)
-    for level, share in enumerate(np.diff(np.linspace(0, 1, steps + 1) ** 2), start=1):
-        value, policy = _advance(chain, value, policy, horizon * share)
-        yield level, continued(value), policy
-
-
-def _in_turns(
-    chain: Chain,
-    transport: Transport,
-    continued: _Continuation,
-    value: np.ndarray,
-    horizon: float,
-    steps: int,
-    first: int,
-) -> Iterator[Level]:
-    """Steps in which drift and noise act in turns, from V (M,) at tau = 0.
-
-    Their lengths are equal, so that their paths are the same. V is noted at the times of all solutions. In the `first`
-    steps V is that of a control that is held, where the noise acts on the faces.
-    """
-    noisy = transport.noise_acts_on_faces()
-    after, policy, times = continued(value), np.zeros(len(value), int), steps * np.linspace(0, 1, steps + 1) ** 2
-    for step in range(steps):
-        before = after
-        policy, moved = _turn(chain, transport, after, policy, horizon / steps)
-        value = _solve(chain, moved, moved, policy, horizon / steps)
-        if step < first:
-            held, best = transport.first(step + 1)
-            value, policy = np.where(noisy, held, value), np.where(noisy, best, policy)
-        after = continued(value)
-        within = times - step
-        for level in np.flatnonzero((within > 0) & (within <= 1)):
-            yield int(level), (1 - within[level]) * before + within[level] * after, policy
-
-
-def _turn(
-    chain: Chain, transport: Transport, field: np.ndarray, policy: np.ndarray, dt: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """The best policy (M,) of a step in turns from V (N,) at all nodes, and V (M,) at the ends of its paths.
-
-    Where candidates are equally good a node keeps the one of `policy` (M,), with which V rose there.
-    """
-    seen, nodes = transport.seen(field), np.arange(len(policy))
-    if chain.shared:
-        best = seen.argmax(0)
-        value = transport.moved(field, best, policy).max(0)
-        return np.where(seen[best, nodes] > seen[policy, nodes] + GAIN, best, policy), value
-    value = seen[policy, nodes]
-    for turn in range(TURNS):
-        if turn:
-            value = _solve(chain, seen[policy, nodes], value, policy, dt)
-        scores = seen + dt * chain.generator(value)
-        best = scores.argmax(0)
-        policy = np.where(scores[best, nodes] > scores[policy, nodes] + GAIN, best, policy)
-    return policy, transport.moved(field, policy)[0]
-
-
-def _advance(chain: Chain, before: np.ndarray, policy: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """V (M,) and the policy (M,) one step after `before` (M,), by policy iteration from `policy` (M,)."""
-    value, nodes = before, np.arange(len(before))
-    for iteration in range(ITERATIONS):
-        rates = chain.generator(value)
-        better = rates.argmax(0)
-        gained = rates[better, nodes] - rates[policy, nodes]
-        if iteration and dt * gained.max() <= TOLERANCE:
-            break
-        # A candidate that is as good as the present one does not replace it, so that the iteration cannot alternate.
-        policy = np.where(dt * gained > TOLERANCE / 10, better, policy)
-        value = _solve(chain, before, value, policy, dt)
-    return value, policy
-
-
-def _solve(chain: Chain, before: np.ndarray, guess: np.ndarray, policy: np.ndarray, dt: float) -> np.ndarray:
-    """V (M,) of a policy (M,) after one implicit step from `before` (M,)."""
-    rates, gain = chain.of(policy)
-    matrix = sparse.eye_array(len(before), format="csr") - dt * rates
-    right, diagonal = before + dt * gain, matrix.diagonal()
-    scaling = LinearOperator(matrix.shape, matvec=lambda residual: residual / diagonal)  # type: ignore[call-arg]
-    value, failed = bicgstab(matrix, right, guess, rtol=0.0, atol=TOLERANCE, maxiter=1000, M=scaling)
-    return np.asarray(spsolve(matrix.tocsc(), right) if failed else value)
-
-
-class _Continuation:
-    """Continues V linearly from the nodes outside A and B through a face to the next nodes inside.
-
-    Interpolation between both then has the value of the set at the face. Where the node outside is very near the face
-    the line may leave [0, 1] by far, and a spline through it oscillates. `bounded` keeps it in [0, 1].
-    """
-
-    def __init__(self, mesh: Mesh, free: np.ndarray, fixed: np.ndarray, chain: Chain, bounded: bool):
-        inside = np.ones(mesh.size, bool)
-        inside[free] = False
-        self._free, self._fixed, self._bounded, self._arms = free, fixed, bounded, []
-        self._count = np.zeros(mesh.size)
-        for arm in (arm for pair in chain.axes for arm in pair):
-            ends = np.flatnonzero(arm.cut & inside[arm.node])
-            self._arms.append((ends, arm.node[ends], arm.value[ends], arm.fraction[ends].clip(LEAST_FRACTION)))
-            np.add.at(self._count, arm.node[ends], 1)
-
-    def __call__(self, value: np.ndarray) -> np.ndarray:
-        """V (N,) at all nodes from V (M,) at the nodes outside A and B."""
-        total = np.zeros(len(self._fixed))
-        for start, node, end, fraction in self._arms:
-            total += np.bincount(node, value[start] + (end - value[start]) / fraction, len(total))
-        result = np.where(self._count > 0, total / np.maximum(self._count, 1), self._fixed)
-        result[self._free] = value
-        return result.clip(0, 1) if self._bounded else result
