@@ -199,12 +199,14 @@ def _bridge(
     else:
         face = torch.where(crossable, distance, -torch.inf).argmax(-1, keepdim=True)
     way = times(sigma, (rates * to_tangent[..., None]).take_along_dim(face[..., None], -2).squeeze(-2))
-    bend = constraints(x - way).gather(-1, face) / before.gather(-1, face)
-    bend = torch.where(bend.isfinite() & crossable.gather(-1, face), bend, 0.0).clamp(min=LEAST_BEND)
+    start, end, chosen = (part.gather(-1, face) for part in (before, after, crossable))
+    bend = constraints(x - way).gather(-1, face) / start
+    bend = torch.where(bend.isfinite(), bend, 0.0).clamp(min=LEAST_BEND)
     root = (1 - 4 * bend).clamp(min=0)
-    at_end = (root + 4 * bend * (after.gather(-1, face) / before.gather(-1, face)).abs()).clamp(min=0).sqrt()
-    root = root.sqrt()
-    nearer = torch.where(root > 0, (1 + root) * (at_end + root) / 4, 0.0)
+    at_end = (root + 4 * bend * (end / start).abs()).clamp(min=0).sqrt()
+    nearer = torch.where(root > 0, (1 + root.sqrt()) * (at_end + root.sqrt()) / 4, 0.0)
+    # Where the path starts inside of the face, or its level has no noise, there is no tangent.
+    nearer = torch.where(chosen & nearer.isfinite(), nearer, 1.0)
     return before, after, squared * torch.ones_like(squared).scatter(-1, face, nearer) * h[..., None]
 
 

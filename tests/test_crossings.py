@@ -203,6 +203,23 @@ def test_a_curved_level_is_crossed_like_the_distance(power, tolerance, faces):
     torch.testing.assert_close(crossed, expected, rtol=0, atol=tolerance)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_levels_without_a_tangent_give_probabilities(dtype):
+    """Levels that are 0, do not change, have no noise, or are no numbers where the tangent is 0."""
+    x = torch.tensor([[0.5, 0.2], [1e-30, 1e-30], [3.0, 1e-3]], dtype=dtype)
+    sigma, time = torch.diag(torch.tensor([0.3, 0.0], dtype=dtype)).expand(3, 2, 2), torch.ones(3, dtype=dtype)
+
+    def levels(y: Tensor) -> Tensor:
+        return torch.stack([y[:, 0] * 0, y[:, 1], (y[:, 0] + 1e-3).log() + 80, y[:, 0].clamp(max=1) * 1e-20], -1)
+
+    for decisive in ("nearest", "farthest"):
+        crossed = crossing_probability(levels, x, x + 0.1, sigma, time, decisive)
+        assert ((crossed >= 0) & (crossed <= 1)).all()
+    uniform, normal = torch.full((2, 3, 4), 0.5, dtype=dtype), torch.zeros(2, 2, 3, 4, dtype=dtype)
+    inside = lambda y: torch.stack([y[:, 0] * 0, y[:, 0] - 9], -1)  # noqa: E731
+    assert enters_intersection(inside, x, x + 0.1, sigma, time, uniform[..., :2], normal[..., :2]).all()
+
+
 def test_a_path_leaves_a_wall_with_its_exact_probability():
     """With drift v away from a face at the distance a, 1 - exp(-2 a v / sigma^2) of the paths never cross it."""
     a, v, s, h = torch.tensor([0.01, 0.1, 0.3], dtype=torch.float64), 1.0, 0.5, 50.0
