@@ -3,7 +3,7 @@
 It also compares the success of a run's policy with that of the grid's.
 
 python benchmarks/grid.py [--json FILE]   # one and two dimensions
-python benchmarks/grid.py --dubins   # the Dubins car in three dimensions, some minutes
+python benchmarks/grid.py --own DubinsCar   # V against Monte Carlo of the grid's own policy, some minutes
 python benchmarks/grid.py --run RUN_DIR   # a run with at most three states
 """
 
@@ -18,10 +18,12 @@ from typing import Any
 
 import torch
 
+from benchmarks.kinds import PROBLEMS
 from benchmarks.record import save
 from pirl_rl import load_run
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.grid import GridSolver
+from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems import DubinsCar, Exit1D, HalfSpace, RadialExit, Reach1D
 from pirl_rl.scoring.truth import DOUBT
 
@@ -58,12 +60,12 @@ def closed_forms() -> list[dict[str, Any]]:
     return rows
 
 
-def dubins(points: int, seed: int, rollouts: int = 2_000) -> None:
+def against_itself(problem: ReachAvoidProblem, points: int, seed: int, rollouts: int = 2_000) -> None:
     """Print V against Monte Carlo of the grid's own policy at 50 states.
 
     V is that of a control that is never held, so that Monte Carlo holds it for a two-thousandth of the horizon.
     """
-    problem, started = DubinsCar(), time.perf_counter()
+    started = time.perf_counter()
     solution = GridSolver(problem, points).solve()
     seconds, (tau, x) = time.perf_counter() - started, states(problem, 50, seed)
     played = monte_carlo(problem, solution.policy, tau, x, rollouts=rollouts, dt=problem.horizon / 2_000)
@@ -72,8 +74,10 @@ def dubins(points: int, seed: int, rollouts: int = 2_000) -> None:
     # The standard error if V is right: that of Monte Carlo's own estimate is 0 where no path, or every path, succeeds.
     noise = (value * (1 - value) / rollouts).sqrt()
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    print(f"DubinsCar, {points} points, {seconds:.0f} s, {memory:.1f} GiB")
-    print(f"mean |V - MC| {distance.mean():.4f}, largest {distance.max():.4f}")
+    print(f"{type(problem).__name__}, {points} points, {seconds:.0f} s, {memory:.1f} GiB")
+    root = distance.square().mean().sqrt()
+    print(f"mean |V - MC| {distance.mean():.4f}, root mean square {root:.4f}, largest {distance.max():.4f}")
+    print(f"success of the policy {played.probability.mean():.4f}, mean V {value.mean():.4f}")
     estimate, within = solution.error(tau, x), (distance <= 3 * noise).double()
     trusted = estimate <= DOUBT
     print(f"mean estimate of the error of V {estimate.mean():.4f}")
@@ -97,18 +101,19 @@ def against(run_dir: str, points: int, steps: int | None, seed: int, rollouts: i
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--dubins", action="store_true")
+    own = {**PROBLEMS, "DubinsCar": DubinsCar}
+    parser.add_argument("--own", choices=own, help="compare V with Monte Carlo of the grid's own policy")
     parser.add_argument("--points", type=int, default=51, help="nodes along each axis")
     parser.add_argument(
         "--steps", type=int, help="steps in time to go, with --run; by default they follow from the problem"
     )
     parser.add_argument("--run", help="compare the policy of this run directory with the grid's")
-    parser.add_argument("--seed", type=int, default=0, help="of the states, with --run and --dubins")
+    parser.add_argument("--seed", type=int, default=0, help="of the states, with --run and --own")
     parser.add_argument("--json", type=Path, help="write what is found in one and two dimensions to this file")
     arguments = parser.parse_args()
     if arguments.run:
         against(arguments.run, arguments.points, arguments.steps, arguments.seed)
-    elif arguments.dubins:
-        dubins(arguments.points, arguments.seed)
+    elif arguments.own:
+        against_itself(own[arguments.own](), arguments.points, arguments.seed)
     else:
         save(arguments.json, {}, rows=closed_forms())
