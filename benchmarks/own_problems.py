@@ -5,10 +5,11 @@
 Some of them took part in choices, with other seeds and states: Gusty and Slalom in those of the logarithms of the
 levels, the networks and the rules of where episodes start, Gusty, Investor, Loiter, Bicycle, TwoHarbours and Sprint in
 those of the inertia of `BestControl`, Gusty and Investor in that of its budget, and TwoHarbours, Bicycle, Sprint and
-Investor in the rules of `pirl_rl.switching`; the others in none. V and the success of the learned policy are compared
-with the grid, in the way of the suite, at 400 states with 1,000 paths from each. With three states and two controls
-there is no truth, and Bearing and Mirror are compared with the products of the grids of their independent subsystems. A
-run takes minutes; a finished one is loaded, so that other settings need another folder.
+Investor in the rules of `pirl_rl.switching`. The crossings of curved faces were mended on TwoLink, and the grid on
+FastCharge, Ferment and those that docs/recipe.md names. The others took part in nothing. V and the success of the
+learned policy are compared with the grid, in the way of the suite, at 400 states with 1,000 paths from each. With three
+states and two controls there is no truth. Bearing and Mirror are compared with the products of the grids of their
+independent subsystems. A run takes minutes; a finished one is loaded, so that other settings need another folder.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ STATES_SEED = 31_000
 """The seed of the states at which runs are measured; no training uses it."""
 
 
-def product(problem: Mixture) -> Truth:
-    """The reference values of independent subsystems: the products of those that the grid has for each of them."""
+def truth_by_parts(problem: Mixture) -> Truth:
+    """The reference values of a mixture: V is the product of those that the grid has for its subsystems."""
     rng = torch.Generator().manual_seed(STATES_SEED)
     x = sample_interior(problem, problem.states, STATES, rng, torch.float64)
     tau = problem.horizon * (EARLIEST + (1 - EARLIEST) * torch.rand(len(x), generator=rng, dtype=x.dtype))
@@ -54,7 +55,9 @@ def product(problem: Mixture) -> Truth:
 def measured(name: str, seed: int, out: Path, settings: dict) -> Score:
     """Train a problem, or load its finished run, and compare it with the grid."""
     problem, folder = PROBLEMS[name](), out / f"{name}-{seed}"
-    truth = product(problem) if isinstance(problem, Mixture) else find_truth(problem, STATES, STATES_SEED, POINTS)
+    truth = (
+        truth_by_parts(problem) if isinstance(problem, Mixture) else find_truth(problem, STATES, STATES_SEED, POINTS)
+    )
     if not (folder / "summary.json").exists():
         pirl_rl.train(problem, folder=folder, seed=seed, report=False, **{"evaluation.during": []}, **settings)
     run = pirl_rl.load_run(folder, problem=problem)

@@ -82,7 +82,7 @@ class Box:
         return torch.stack(columns).movedim(0, -1)
 
     def within_period(self, function: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
-        """A function of points (*, n) that gives `function` at the points that `wrap` makes of them."""
+        """The function of points (*, n) that brings them into the period by `wrap` and gives `function` there."""
         return lambda x: function(self.wrap(x))
 
     def contains(self, x: Tensor) -> Tensor:

@@ -232,3 +232,11 @@ def test_a_short_training_learns_the_exit_of_an_arc(tmp_path):
     assert error.square().mean() < 2e-3
     seam = torch.tensor([[3 - 1e-5], [3 + 1e-5]])
     torch.testing.assert_close(*run.solution.raw_value(torch.full((2,), 2.0), seam), rtol=0, atol=1e-4)
+
+
+def test_levels_beyond_the_period_are_those_within_it():
+    """A tangent next to the seam has its zero beyond it, where the level as written knows nothing of the period."""
+    circle = Box([-1.0, 0.0], [1.0, 1.0], periodic=[0])
+    level = circle.within_period(lambda x: x[..., 0].abs())
+    x = torch.tensor([[0.5, 9.0], [1.25, 9.0], [-1.75, 9.0]])
+    assert level(x).tolist() == [0.5, 0.75, 0.25]

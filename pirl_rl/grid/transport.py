@@ -128,7 +128,7 @@ class Transport:
 
         Args:
             field: V (N,) at all nodes, continued into A and B.
-            policies: the numbers of the candidates.
+            policies: the numbers (M,) of the candidates of each policy.
         """
         padded = self._padded(field)
         spline = spline_filter(padded, order=3, mode="mirror")
