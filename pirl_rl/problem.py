@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import ClassVar, Literal
 
 import torch
@@ -20,12 +21,15 @@ from pirl_rl.errors import ProblemError
 from pirl_rl.payoffs import Indicator, Payoff
 from pirl_rl.sets import Box, Plane
 
+RANDOM_STATES, WIDER = 100_000, 1.5
+"""The number of random states at which A and B are compared, and by which factor their box is wider than `states`."""
+
 
 class ReachAvoidProblem(ABC):
     """The base class of problems.
 
     A subclass defines `horizon`, `states`, `controls`, `drift`, `diffusion`, and `target_level` or
-    `target_constraints`; an invariance problem needs no target.
+    `target_constraints`; an invariance problem needs no target. States in both A and B count as failures.
 
     Args:
         payoff: replaces the payoff of the class.
@@ -129,11 +133,42 @@ class ReachAvoidProblem(ABC):
         kind, base = type(self), ReachAvoidProblem
         return kind.avoid_level is not base.avoid_level or kind.avoid_constraints is not base.avoid_constraints
 
+    def random_states(self) -> Tensor:
+        """The same 100,000 states in each call (100,000, n), in a box 1.5 times as wide as that of the states."""
+        rng = torch.Generator().manual_seed(0)
+        return self.states.expand(WIDER).sample(RANDOM_STATES, rng, torch.float64)
+
+    def overlap(self) -> Tensor:
+        """Those of the random states that lie in both A and B (k, n)."""
+        x = self.random_states()
+        return x[(self.target_level(x) <= 0) & self.failed(x)]
+
+    @cached_property
+    def shared_constraints(self) -> list[int]:
+        """The numbers of the constraints of B that hold at some states of A, see `overlap`."""
+        if self.objective == "invariance" or not self.has_avoid_set:
+            return []
+        return (self.avoid_constraints(self.overlap()) <= 0).any(0).nonzero().flatten().tolist()
+
+    def free_target_constraints(self, x: Tensor) -> Tensor:
+        """Levels (*, k), at states (*, n), whose intersection is A without B: a state in both sets is a failure.
+
+        The theory has disjoint sets. Where A and B overlap, the constraints of B that A meets are added with the
+        opposite sign.
+        """
+        levels = self.target_constraints(x)
+        if not self.shared_constraints:
+            return levels
+        return torch.cat([levels, -self.avoid_constraints(x)[..., self.shared_constraints]], -1)
+
     def reached_constraints(self, x: Tensor) -> Tensor:
-        """Levels (*, k), at states (*, n), of the set that absorbs with success: A, or A_eps of a smoothed payoff."""
+        """Levels (*, k), at states (*, n), of the set that absorbs with success: A, or A_eps of a smoothed payoff.
+
+        It has no states of B, see `free_target_constraints`.
+        """
         if self.payoff.epsilon == 0:
-            return self.target_constraints(x)
-        return _normalized(self.target_constraints, x) + self.payoff.epsilon
+            return self.free_target_constraints(x)
+        return _normalized(self.free_target_constraints, x) + self.payoff.epsilon
 
     def reached(self, x: Tensor) -> Tensor:
         """Whether states (*, n) are absorbed with success, (*) bool; never in an invariance problem."""
@@ -159,7 +194,7 @@ class ReachAvoidProblem(ABC):
             return alive
         if self.payoff.epsilon == 0:
             return alive * self.payoff(self.target_level(x))
-        return alive * self.payoff(_normalized(self.target_constraints, x).amax(-1))
+        return alive * self.payoff(_normalized(self.free_target_constraints, x).amax(-1))
 
 
 def _normalized(levels, x: Tensor) -> Tensor:

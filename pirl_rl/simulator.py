@@ -210,11 +210,11 @@ class Simulator:
     @cached_property
     def _crossings(self) -> tuple[int, int]:
         """The numbers of constraints of A and of B whose crossings are drawn."""
-        problem, bridge = self.problem, self.crossing == "bridge"
+        problem = self.problem
         x = problem.states.sample(2, torch.Generator().manual_seed(0))
-        target = problem.reached_constraints(x).shape[-1] if bridge and problem.objective == "reach-avoid" else 0
-        avoid = problem.avoid_constraints(x).shape[-1] if bridge and problem.has_avoid_set else 0
-        return target, avoid
+        target = problem.reached_constraints(x).shape[-1] if problem.objective == "reach-avoid" else 0
+        avoid = problem.avoid_constraints(x).shape[-1] if problem.has_avoid_set else 0
+        return (target, avoid) if self.crossing == "bridge" else (0, 0)
 
     def _advance(
         self,

@@ -78,9 +78,16 @@ class UndefinedLevel(Pendulum):
         return super().avoid_level(x) + 0 * x[..., 0].log()
 
 
-class Overlap(ZermeloBoat):
+class Overlap(Reach1D):
+    """The states from 2 to 2.5 lie in both sets."""
+
     def avoid_level(self, x):
-        return self.target_level(x) - 0.01
+        return (x[..., 0] - 2).abs() - 0.5
+
+
+class DrownedTarget(Reach1D):
+    def avoid_level(self, x):
+        return self.target_level(x) - 0.1
 
 
 class EmptyTarget(ZermeloBoat):
@@ -252,7 +259,8 @@ FAULTS = [
     (Infinite, "error", "diffusion", "expected finite numbers"),
     (UndefinedBeyond, "warning", "drift", "beyond the box"),
     (UndefinedLevel, "error", "avoid_level", "expected finite numbers"),
-    (Overlap, "error", "states", "overlap"),
+    (Overlap, "warning", "target_level", "count as failures"),
+    (DrownedTarget, "error", "target_level", "one that lies in it"),
     (EmptyTarget, "error", "target_level", "no point of the target was found"),
     (FarTarget, "error", "target_level", "no point of the target was found"),
     (TargetNextToTheBox, "warning", "target_level", "outside the box"),
@@ -318,9 +326,9 @@ def test_large_units_give_no_alarm():
 
 
 def test_a_point_and_a_line_are_shown():
-    finding = next(finding for finding in examine(Overlap()) if finding.level == "error")
+    finding = next(finding for finding in examine(DrownedTarget()) if finding.level == "error")
     assert re.search(
-        r"Overlap.states \(test_checking.py, line \d+\): target and avoid set overlap.* for example x = \[",
+        r"DrownedTarget.target_level \(.*, line \d+\): expected a target outside .* For example at x = \[",
         str(finding),
     )
     undefined = next(finding for finding in examine(Undefined()) if finding.level == "error")

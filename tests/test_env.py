@@ -9,7 +9,6 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from pirl_rl.envs import ReachAvoidEnv
-from pirl_rl.errors import ProblemError
 from pirl_rl.payoffs import SmoothPayoff
 from pirl_rl.problems import Reach1D, Safety1D
 from pirl_rl.problems.reach1d_env import Reach1DEnv
@@ -235,15 +234,6 @@ def test_a_given_state_can_be_set():
     td = env.reset(start, set_state=True)
     assert torch.equal(td["state"], start["state"])
     assert torch.equal(td["tau"], start["tau"])
-
-
-def test_overlapping_sets_are_refused():
-    class Overlap(Reach1D):
-        def avoid_level(self, x):
-            return 2.5 - x[..., 0]
-
-    with pytest.raises(ProblemError, match="overlap"):
-        ReachAvoidEnv(Overlap())
 
 
 @pytest.mark.parametrize("kwargs", [{"dt": 3.0}, {"num_envs": 0}, {"num_envs": 2.5}, {"crossing": "never"}])

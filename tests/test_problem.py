@@ -15,7 +15,7 @@ from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.operators import generator
 from pirl_rl.payoffs import LipschitzPayoff
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.problems import Exit1D, HalfSpace, RadialExit, Reach1D, Safety1D
+from pirl_rl.problems import DubinsCar, Exit1D, HalfSpace, Pendulum, RadialExit, Reach1D, Safety1D, ZermeloBoat
 from pirl_rl.sets import Box
 from pirl_rl.structure import check_problem, has_controlled_noise
 
@@ -253,33 +253,77 @@ def test_a_missing_drift_is_named():
         Incomplete()
 
 
+class Overlap(Reach1D):
+    """A target above 2 and an avoid set about 2; the states in both are failures."""
+
+    width = 0.5
+
+    def avoid_constraints(self, x):
+        return torch.stack([x[..., 0] + 5, (x[..., 0] - 2).abs() - self.width], -1)
+
+    def avoid_level(self, x):
+        return self.avoid_constraints(x).amin(-1)
+
+
 @pytest.mark.parametrize("width", [0.5, 0.005])
-def test_overlap_is_found_and_one_point_of_it_named(width):
-    """Sets that share a sliver of the box, found on at least 100,000 points."""
-
-    class Overlap(Reach1D):
-        def avoid_level(self, x):
-            return (x[..., 0] - 2).abs() - width
-
-    with pytest.raises(
-        ProblemError, match=r"target and avoid set overlap.* of 1\d{5} sampled points.*x = \["
-    ) as caught:
-        check_problem(Overlap())
-    point = float(str(caught.value).split("x = [")[1].split("]")[0])
-    assert 2 <= point <= 2 + width
+def test_the_target_is_what_lies_outside_the_avoid_set(width):
+    problem = Overlap()
+    problem.width = width
+    both = problem.overlap()
+    assert ((both >= 2) & (both <= 2 + width)).all()
+    assert problem.shared_constraints == [1]
+    x = torch.tensor([[1.9], [2 + width / 2], [2 + 2 * width]])
+    assert problem.reached(x).tolist() == [False, False, True]
+    assert problem.failed(x).tolist() == [width == 0.5, True, False]
+    assert problem.boundary_value(x).tolist() == [0, 0, 1]
+    check_problem(problem)
 
 
-def test_a_target_without_the_set_to_avoid_overlaps_no_more():
-    """The further constraint that the message of an overlap names, as the larger of two levels."""
+class Reef(ZermeloBoat):
+    """A reef that covers one side of the harbour."""
 
-    class Overlap(Reach1D):
-        def avoid_level(self, x):
-            return (x[..., 0] - 2).abs() - 0.5
+    def avoid_constraints(self, x):
+        reef = (x - x.new_tensor([self.landing[0] + 0.4, self.landing[1]])).norm(dim=-1, keepdim=True) - 0.3
+        return torch.cat([super().avoid_constraints(x), reef], -1)
 
-    class Apart(Overlap):
-        def target_level(self, x):
-            return torch.maximum(super().target_level(x), -self.avoid_level(x))
 
-    with pytest.raises(ProblemError, match=r"further constraint -self\.avoid_level\(x\)"):
-        check_problem(Overlap())
-    check_problem(Apart())
+class NamedReef(Reef):
+    """The same problem, with a target that excludes the reef itself."""
+
+    target_level = ReachAvoidProblem.target_level
+
+    def target_constraints(self, x):
+        return torch.stack([ZermeloBoat.target_level(self, x), -self.avoid_constraints(x)[..., -1]], -1)
+
+
+def test_paths_take_a_shared_constraint_as_if_the_target_had_it():
+    x = Reef().states.sample(200, torch.Generator().manual_seed(0))
+    tau = torch.full((len(x),), Reef().horizon)
+
+    def policy(tau, x):
+        return 0.8 * torch.tanh(x.new_tensor(ZermeloBoat.landing) - x)
+
+    success = [
+        monte_carlo(problem, policy, tau, x, rollouts=20, dt=0.05, seed=1).probability
+        for problem in (Reef(), NamedReef())
+    ]
+    assert [len(problem.shared_constraints) for problem in (Reef(), NamedReef())] == [1, 0]
+    assert torch.equal(*success)
+    assert 0.05 < success[0].mean() < 0.95
+
+
+def test_the_constraints_of_disjoint_sets_stay_as_they_are():
+    for problem in (Reach1D(), ZermeloBoat(), DubinsCar(), Pendulum()):
+        x = problem.states.sample(100, torch.Generator().manual_seed(0))
+        assert problem.shared_constraints == []
+        if problem.objective == "reach-avoid":
+            assert torch.equal(problem.reached_constraints(x), problem.target_constraints(x))
+
+
+def test_a_smoothed_target_has_no_states_of_the_avoid_set():
+    problem = Overlap(payoff=LipschitzPayoff(0.1))
+    x = torch.linspace(1.5, 4, 501).unsqueeze(-1)
+    inside = problem.reached(x)
+    assert inside.any()
+    assert not (inside & problem.failed(x)).any()
+    assert x[inside].min() >= 2.6 - 1e-6

@@ -59,7 +59,7 @@ def examine(problem: ReachAvoidProblem, dt: float | None = None, substeps: int |
         [methods.batches],
         [methods.arrangements],
         [methods.finite, methods.derivatives],
-        [level_sets.agreement, level_sets.sizes, level_sets.places],
+        [level_sets.agreement, level_sets.sizes, level_sets.overlap, level_sets.places],
         [
             dynamics.controls,
             dynamics.noise,

@@ -10,6 +10,7 @@ from pirl_rl.checking.findings import Finding, found
 from pirl_rl.checking.samples import Samples, defines
 from pirl_rl.descent import descended
 from pirl_rl.errors import ProblemError
+from pirl_rl.problem import RANDOM_STATES
 from pirl_rl.sampling.faces import find_faces
 from pirl_rl.sampling.initial_states import sample_interior
 
@@ -46,6 +47,21 @@ def sizes(samples: Samples) -> Iterator[Finding]:
     except ProblemError:
         message = "expected states outside the target and the avoid set, at which episodes start, got none in the box."
         yield found(problem, "error", "states", message)
+
+
+def overlap(samples: Samples) -> Iterator[Finding]:
+    """The sets should be disjoint; a state in both is a failure, see `ReachAvoidProblem.free_target_constraints`."""
+    problem = samples.problem
+    if not problem.shared_constraints:
+        return
+    both, part = problem.overlap(), _part(samples, "target")
+    count = f"{len(both):,} of {RANDOM_STATES:,} random states"
+    if problem.reached(problem.random_states()).any():
+        message = f"target and avoid set overlap, at {count}; states in both count as failures, not as the target."
+        yield found(problem, "warning", part, message, both[0])
+    else:
+        message = f"expected a target outside the avoid set, got one that lies in it, with {count} in both."
+        yield found(problem, "error", part, message, both[0])
 
 
 def places(samples: Samples) -> Iterator[Finding]:

@@ -86,7 +86,7 @@ class Ends:
 
         With a smoothed payoff, success is to come to the smaller A_eps, and failure is not even to come to A.
         """
-        return self.problem.reached_constraints(x) if self.success else self.problem.target_constraints(x)
+        return self.problem.reached_constraints(x) if self.success else self.problem.free_target_constraints(x)
 
     def avoid(self, x: Any) -> Any:
         """Levels (N, k) at states (N, n), tensors or affine forms, whose union is B."""
