@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.kinds import Bicycle, Crosswind, Gusty, Loiter
+from benchmarks.kinds import Bicycle, Crosswind, Duffing, Gusty, Loiter, Swingup
 from pirl_rl import Box, ReachAvoidProblem
 from pirl_rl.crossings import first_passage
 from pirl_rl.errors import ArgumentError
@@ -470,8 +470,12 @@ def test_the_estimate_sees_jumps_that_both_meshes_smear_alike():
     assert (solution._distance(tau, x)[wrong] <= DOUBT).double().mean() > 0.05, "the distance of both would do"
 
 
-@pytest.mark.parametrize(("problem", "split"), [(DubinsCar(), True), (HalfSpace(dim=3), False), (Calm(2), True)])
+@pytest.mark.parametrize(
+    ("problem", "split"),
+    [(DubinsCar(), True), (HalfSpace(dim=3), False), (Calm(2), True), (Duffing(), True), (Swingup(), True)],
+)
 def test_drift_and_noise_act_in_turns_where_the_noise_is_weak(problem, split):
+    """The forces of Duffing and Swingup grow in the margin of the mesh, where they ask for no shorter steps."""
     assert GridSolver(problem, points=11, estimate=False).solve().split == split
 
 

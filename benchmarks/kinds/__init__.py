@@ -6,6 +6,7 @@ from benchmarks.kinds.mixtures import Bearing, Mirror, Mixture
 from benchmarks.kinds.passages import SlotChange, TwoLink
 from benchmarks.kinds.plants import Epidemic, Investor, Reservoir, Toggle, Tokens, TwoTanks
 from benchmarks.kinds.stores import FastCharge, Ferment, Forager
+from benchmarks.kinds.swings import Duffing, MountainCar, Swingup
 from benchmarks.kinds.vehicles import Bicycle, Evader, Loiter, Ring, River, Slalom, Steering, TwoCars, TwoHarbours
 from pirl_rl import ReachAvoidProblem
 
@@ -14,6 +15,6 @@ __all__ = ["KINDS", "PROBLEMS", "Mixture"]
 KINDS: tuple[type[ReachAvoidProblem], ...] = (Servo, Steering, Evader, Gusty, TwoTanks, Reservoir, Slalom, Orbit, Ring)
 KINDS += (VanDerPol, TwoHarbours, River, Loiter, Crosswind, Bicycle, Tokens, Lander, Epidemic, Toggle, TwoCars, Sprint)
 KINDS += (Investor, Runaway, JetLag, Searchlight, PowerSwing, Forager, Ferment, FastCharge, SlotChange, TwoLink)
-KINDS += (Bearing, Mirror)
+KINDS += (Bearing, Mirror, Duffing, MountainCar, Swingup)
 
 PROBLEMS = {kind.__name__: kind for kind in KINDS}

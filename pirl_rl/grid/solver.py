@@ -131,6 +131,19 @@ class GridSolver:
         steps = max(self.points) if self.steps is None else self.steps
         if not is_weak(self.problem, mesh, x, controls):
             return steps, False
-        needed = math.ceil(self.problem.horizon * speed_limit(self.problem, mesh, x, controls) / FARTHEST)
-        most = MOST_STEPS * steps if self.steps is None else steps
-        return (max(steps, needed), True) if needed <= most else (steps, False)
+        if self.steps is None:
+            # A force that grows outside the box of states, in the margin of the mesh, must not rule the steps out.
+            most, parts = MOST_STEPS * steps, (slice(None), self._in_box(x))
+        else:
+            most, parts = steps, (slice(None),)
+        for kept in parts:
+            speed = speed_limit(self.problem, mesh, x[kept], controls[:, kept])
+            needed = math.ceil(self.problem.horizon * speed / FARTHEST)
+            if needed <= most:
+                return max(steps, needed), True
+        return steps, False
+
+    def _in_box(self, x: np.ndarray) -> np.ndarray:
+        """Which of the nodes x (M, n) lie in the box of states (M,); all of them if none does."""
+        inside = self.problem.states.contains(torch.from_numpy(x)).numpy()
+        return inside | (not inside.any())

@@ -1,0 +1,72 @@
+"""A mass in two wells, a car in a valley and a pendulum, whose force is too weak for the direct way."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from benchmarks.kinds.shapes import constant, rows
+from pirl_rl import Box, ReachAvoidProblem
+
+
+class Duffing(ReachAvoidProblem):
+    """Bring a mass from anywhere to rest in the right one of two wells, never faster than 1.2 m/s.
+
+    The barrier takes 0.385 N, and there are 0.2 N.
+    """
+
+    horizon = 6.0
+    states, controls = Box([-1.7, -1.2], [1.7, 1.2]), Box([-0.2], [0.2])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        p, v = x.unbind(-1)
+        return rows(v, p - p**3 - 0.3 * v + u[..., 0])
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return constant(x, [0.0], [0.25])
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        p, v = x.unbind(-1)
+        return rows(0.7 - p, p - 1.3, v - 0.4, -0.4 - v)
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        return 1.2 - x[..., 1:].abs()
+
+
+class MountainCar(ReachAvoidProblem):
+    """The mountain car of A. W. Moore (thesis, Cambridge, 1990) in continuous time, with gusts and a wall behind."""
+
+    horizon = 6.0
+    states, controls = Box([-1.2, -1.4], [0.45, 1.4]), Box([-0.35], [0.35])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return rows(x[..., 1], u[..., 0] - torch.cos(3 * x[..., 0]))
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return constant(x, [0.0], [0.25])
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return 0.45 - x[..., :1]
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        return x[..., :1] + 1.2
+
+
+class Swingup(ReachAvoidProblem):
+    """Swing a pendulum (1 kg, 1 m) up with 5 N m, about half of what holds it level; the angle 0 is upright."""
+
+    horizon = 4.0
+    states = Box([-math.pi, -8.0], [math.pi, 8.0], periodic=[0])
+    controls = Box([-5.0], [5.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        angle, speed = x.unbind(-1)
+        return rows(speed, 9.81 * torch.sin(angle) + u[..., 0] - 0.1 * speed)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return constant(x, [0.0], [1.0])
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return rows(math.cos(0.3) - torch.cos(x[..., 0]), x[..., 1].abs() - 1)
