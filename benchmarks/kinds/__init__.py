@@ -1,5 +1,7 @@
 """Problems of other kinds than those of the suite, each written as a user would write it."""
 
+from benchmarks.kinds.approaches import Chain, Pursuit, Rendezvous, Unicycle
+from benchmarks.kinds.compartments import Anaesthesia, LotkaVolterra, Rooms
 from benchmarks.kinds.cycles import JetLag, PowerSwing, Runaway, Searchlight
 from benchmarks.kinds.masses import Crosswind, Gusty, Lander, Orbit, Servo, Sprint, VanDerPol
 from benchmarks.kinds.mixtures import Bearing, Mirror, Mixture
@@ -15,6 +17,7 @@ __all__ = ["KINDS", "PROBLEMS", "Mixture"]
 KINDS: tuple[type[ReachAvoidProblem], ...] = (Servo, Steering, Evader, Gusty, TwoTanks, Reservoir, Slalom, Orbit, Ring)
 KINDS += (VanDerPol, TwoHarbours, River, Loiter, Crosswind, Bicycle, Tokens, Lander, Epidemic, Toggle, TwoCars, Sprint)
 KINDS += (Investor, Runaway, JetLag, Searchlight, PowerSwing, Forager, Ferment, FastCharge, SlotChange, TwoLink)
-KINDS += (Bearing, Mirror, Duffing, MountainCar, Swingup)
+KINDS += (Bearing, Mirror, Duffing, MountainCar, Swingup, Pursuit, Rooms, Anaesthesia)
+KINDS += (LotkaVolterra, Chain, Unicycle, Rendezvous)
 
 PROBLEMS = {kind.__name__: kind for kind in KINDS}
