@@ -190,7 +190,9 @@ def ascend(objective: Objective, action: Tensor, levels: Tensor, sweeps: int = 1
     return action, best
 
 
-def improved(objective: Objective, action: Tensor, levels: Tensor, inertia: float = 0.0) -> tuple[Tensor, Tensor]:
+def improved(
+    objective: Objective, action: Tensor, levels: Tensor, inertia: float = 0.0, near: float = 0.0, stride: int = 1
+) -> tuple[Tensor, Tensor]:
     """The best level of each coordinate while the others stand still, for all coordinates in one call of the objective.
 
     If H is a sum of functions of one coordinate each, the best levels together are the maximum over the levels. Where
@@ -206,30 +208,62 @@ def improved(objective: Objective, action: Tensor, levels: Tensor, inertia: floa
     Args:
         objective: the function to maximise, for actions (*, N, m).
         action: the action (N, m) that is improved.
-        levels: the levels (k,) of each coordinate, bounds included, or the combinations (K, s) of levels of each s
-            coordinates in a row.
+        levels: the levels (k,) of each coordinate in rising order, bounds included, or the combinations (K, s) of
+            levels of each s coordinates in a row.
         inertia: that share, >= 0.
+        near: the distance up to which a level loses nothing, and from which its distance counts, >= 0.
+        stride: with a number above 1, which divides k - 1, every such level is tried first, and then those between the
+            best of them and its neighbours, of which there are 2 (stride - 1). Only for levels of single coordinates.
 
     Returns:
         The action (N, m), whose objective is at least that of the given one, and how much each group matters
-        (N, m / s): the range of the objective over its levels and the given action.
+        (N, m / s): the range of the objective over the levels that were tried and the given action.
     """
     levels = levels.reshape(len(levels), -1)
     size = levels.shape[1]
     groups = action.shape[-1] // size
     own = torch.eye(groups, dtype=torch.bool, device=action.device).repeat_interleave(size, 1)
-    values = objective(torch.where(own[:, None, None], levels.repeat(1, groups).unsqueeze(1), action))
-    before = objective(action)
-    stakes = torch.maximum(values.amax(1), before) - torch.minimum(values.amin(1), before)
     parts = action.unflatten(-1, (groups, size)).movedim(-2, 0)  # (groups, N, s)
-    distance = (levels[:, None] - parts.unsqueeze(1)).abs().amax(-1)
-    index = (values - inertia * stakes.unsqueeze(1) * distance).argmax(1)
+    before = objective(action)
+
+    def tried(options: Tensor) -> Tensor:
+        """The objective (groups, k, N) of options (groups, k, N, s), each with the other groups at the action."""
+        return objective(torch.where(own[:, None, None], options.repeat(1, 1, 1, groups), action))
+
+    options = levels[::stride, None].expand(groups, -1, len(action), -1)
+    values = tried(options)
+    index, stakes = _preferred(values, before, options, parts, inertia, near)
+    if stride > 1:
+        steps = torch.arange(1, stride, device=action.device)
+        beside = torch.cat([-steps, steps]).unsqueeze(-1)
+        between = levels[(stride * index.unsqueeze(1) + beside).clamp(0, len(levels) - 1)]
+        options = torch.cat([options, between], 1)
+        values = torch.cat([values, tried(between)], 1)
+        index, stakes = _preferred(values, before, options, parts, inertia, near)
     top = values.gather(1, index.unsqueeze(1)).squeeze(1)
-    together = torch.where((top > before).unsqueeze(-1), levels[index], parts).movedim(0, -2).flatten(-2)
+    chosen = options.gather(1, index[:, None, :, None].expand(-1, -1, -1, size)).squeeze(1)
+    together = torch.where((top > before).unsqueeze(-1), chosen, parts).movedim(0, -2).flatten(-2)
     alone, which = top.max(0)
     single = torch.where(own[which], together, action)
     best = torch.where((objective(together) >= alone).unsqueeze(-1), together, single)
     return best, stakes.mT
+
+
+def _preferred(
+    values: Tensor, before: Tensor, options: Tensor, parts: Tensor, inertia: float, near: float
+) -> tuple[Tensor, Tensor]:
+    """The best option of each group after inertia (groups, N), and the range of the values (groups, N).
+
+    Args:
+        values: of the options (groups, k, N).
+        before: the value (N,) of the given action.
+        options: (groups, k, N, s).
+        parts: the coordinates of the given action (groups, N, s).
+        inertia, near: see `improved`.
+    """
+    stakes = torch.maximum(values.amax(1), before) - torch.minimum(values.amin(1), before)
+    distance = ((options - parts.unsqueeze(1)).abs().amax(-1) - near).clamp(min=0)
+    return (values - inertia * stakes.unsqueeze(1) * distance).argmax(1), stakes
 
 
 def replaced(action: Tensor, column: int, level: Tensor | float) -> Tensor:

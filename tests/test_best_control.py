@@ -282,6 +282,42 @@ def test_inertia_does_not_matter_where_the_objective_is_affine():
     assert torch.equal(improved(objective, start, levels, 0.1)[0], improved(objective, start, levels)[0])
 
 
+def test_inertia_stops_an_action_before_the_maximum_unless_near_levels_are_free():
+    """f(a) = -a^2 from 0.3: with inertia 0.1 the best of f - 0.1 |a - 0.3| lies at 0.05, and without it at 0."""
+    start, levels = torch.tensor([[0.3]]), torch.linspace(-1, 1, 401)
+
+    def objective(action):
+        return -action.square().squeeze(-1)
+
+    assert improved(objective, start, levels, 0.1)[0].item() == pytest.approx(0.05, abs=1e-6)
+    assert improved(objective, start, levels, 0.1, near=0.3)[0].item() == pytest.approx(0.0, abs=1e-6)
+    assert improved(objective, start, levels, 0.1, near=0.1)[0].item() == pytest.approx(0.05, abs=1e-6)
+
+
+@pytest.mark.parametrize("inertia", [0.0, 0.1])
+def test_every_fourth_level_leads_to_the_best_of_all_where_there_is_one_maximum(inertia):
+    """f(a) = -(a_1 - c)^2 + a_1 a_2 / 4 - 2 |a_2 - d|, which is concave in each coordinate."""
+    rng = torch.Generator().manual_seed(4)
+    peak, start = (2 * torch.rand(300, 2, generator=rng, dtype=torch.float64) - 1 for _ in range(2))
+    calls = []
+
+    def objective(action):
+        calls.append(action.shape[:-1].numel())
+        first, second = action.unbind(-1)
+        return -(first - peak[:, 0]).square() + first * second / 4 - 2 * (second - peak[:, 1]).abs()
+
+    levels = torch.linspace(-1, 1, 33, dtype=torch.float64)
+    best, stakes = improved(objective, start, levels, inertia, stride=4)
+    few = sum(calls)
+    calls.clear()
+    every, range_of_all = improved(objective, start, levels, inertia)
+    assert few == 300 * (1 + 2 * (9 + 6) + 1)
+    assert sum(calls) == 300 * (1 + 2 * 33 + 1)
+    assert torch.allclose(best, every)
+    assert (stakes <= range_of_all + 1e-12).all()
+    assert (stakes >= 0.9 * range_of_all).all()
+
+
 @pytest.mark.parametrize("controlled", [False, True])
 def test_an_improvement_is_none_for_the_worse(controlled):
     problem = Steered(controlled)
@@ -308,12 +344,13 @@ def test_more_controls_take_fewer_points():
 def test_where_candidates_are_simulated_the_points_are_fewer():
     """With three controls and five levels, each point needs 15 cubatures, or 15 paths of two steps.
 
-    With seven levels, the choices of an actor for example, it needs 21 cubatures. The four ends of one count as a step.
+    With seven levels, the choices of an actor for example, it needs 21 cubatures. The four ends of one count as two
+    steps.
     """
     problem = Steered(controlled=True)
     simulator = Simulator(problem, 0.1)
-    assert BestControl(problem, simulator, budget=10 * 15 + 14).most_points(groups=3, levels=5) == 10
-    assert BestControl(problem, simulator, budget=10 * 21 + 20).most_points(groups=3, levels=7) == 10
+    assert BestControl(problem, simulator, budget=10 * 30 + 29).most_points(groups=3, levels=5) == 10
+    assert BestControl(problem, simulator, budget=10 * 42 + 41).most_points(groups=3, levels=7) == 10
     assert BestControl(problem, simulator, steps=2, budget=10 * 30 + 29).most_points(groups=3, levels=5) == 10
 
 

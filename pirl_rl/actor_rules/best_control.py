@@ -18,7 +18,7 @@ from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 from pirl_rl.structure import noise_channels
-from pirl_rl.switching import LEVELS, control_levels
+from pirl_rl.switching import FINE_LEVELS, LEVELS, control_levels
 
 INERTIA = 0.1
 """The inertia for an actor whose output is a tanh, and for all actors where the noise depends on the control."""
@@ -29,6 +29,13 @@ CHOICE_INERTIA = 0.02
 Such an actor passes through nothing between two numbers, and must get from a heading of pi to one just above -pi, or
 from forwards to backwards. Where sigma depends on u, levels are compared by second differences of V, which are less
 exact, and the best of many nearly equal levels would change with each small change of V.
+"""
+
+STRIDE, NEAR = 4, 0.15
+"""How a cubature looks for the best of `FINE_LEVELS` levels.
+
+Every fourth is tried, and then those between the best and its neighbours. Inertia counts from this distance on: between
+the bounds the objective is flat about its maximum, and inertia would stop an actor before it.
 """
 
 
@@ -55,7 +62,8 @@ class BestControl(ActorRule):
     step with the candidate, the others with the policy, the rollout algorithm of D. Bertsekas (Rollout, Policy
     Iteration, and Distributed Reinforcement Learning, 2020).
 
-    Each coordinate takes its best level while the others stand still, see `pirl_rl.ascent.improved`.
+    Each coordinate takes its best level while the others stand still, see `pirl_rl.ascent.improved`. Of many levels a
+    cubature does not try all, see `STRIDE` and `NEAR`.
 
     Args:
         problem: the physics.
@@ -67,7 +75,7 @@ class BestControl(ActorRule):
         budget: the largest number of points times controls; of more points the first are taken, so that an update of
             the actor does not cost more with more controls. Where candidates are simulated, it is the largest number of
             simulated states. Each level of each control at each point then needs `steps` of them for a look ahead, and
-            w/2 for the cubature with w noise channels: each of its 2w ends counts as a quarter, since it needs V alone.
+            w for the cubature with w noise channels: each of its 2w ends counts as a half, since it needs V alone.
         inertia: what a level loses for each unit of its distance from the actor's output when levels are compared, as a
             share of the range of the Hamiltonian, >= 0; see `pirl_rl.ascent.improved`. Where noise grows with |u|, both
             bounds are good beside a convex obstacle, and the worst control lies between them. Without inertia the
@@ -101,24 +109,28 @@ class BestControl(ActorRule):
         self.controlled_noise, self.compiles_whole = simulator.controlled_noise, steps == 0
         channels, self.budget = noise_channels(problem), budget
         self.cubature = steps == 0 and self.controlled_noise and channels * problem.controls.dim <= 64
-        self.simulated = steps or (channels / 2 if self.cubature else 0)
+        self.simulated = steps or (channels if self.cubature else 0)
         self.flow: Flow = simulator.flow
 
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
         actor, choice = solution.actor, solution.actor.choice
-        near = points["state"]
+        like = points["state"]
         if choice:
-            levels = choice.combinations(near)
+            levels = choice.combinations(like)
         else:
-            levels = torch.linspace(-1, 1, self.levels, dtype=near.dtype, device=near.device).unsqueeze(-1)
-        most = self.most_points(solution.problem.controls.dim // levels.shape[1], len(levels))
+            levels = torch.linspace(-1, 1, self.levels, dtype=like.dtype, device=like.device).unsqueeze(-1)
+        fine = self.cubature and levels.shape == (FINE_LEVELS, 1)
+        stride, near = (STRIDE, NEAR) if fine else (1, 0.0)
+        tried = len(levels[::stride]) + 2 * (stride - 1)
+        most = self.most_points(solution.problem.controls.dim // levels.shape[1], tried)
         tau, x = points["tau"][:most], points["state"][:most]
         logits = actor.logits(tau, x)
         with torch.no_grad():
             action = actor.layers[-1](logits)
             objective = self._objective(solution, tau.squeeze(-1), x)
             usual = CHOICE_INERTIA if choice and not self.controlled_noise else INERTIA
-            best, weight = improved(objective, action, levels, usual if self.inertia is None else self.inertia)
+            inertia = usual if self.inertia is None else self.inertia
+            best, weight = improved(objective, action, levels, inertia, near, stride)
         if choice:
             scores = choice.grouped(logits).movedim(-1, 1)
             entropy = torch.nn.functional.cross_entropy(scores, choice.indices(best), reduction="none")
