@@ -66,10 +66,11 @@ class Chain(ReachAvoidProblem):
         return torch.diag_embed(torch.full_like(x, 0.2))
 
     def target_constraints(self, x: Tensor) -> Tensor:
-        return x.abs() - 0.6
+        return torch.cat([x - 0.6, -0.6 - x], -1)
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
-        return x.new_tensor([4.0, 2.0, 2.0, 2.0]) - x.abs()
+        edge = x.new_tensor([4.0, 2.0, 2.0, 2.0])
+        return torch.cat([edge - x, edge + x], -1)
 
 
 class Rendezvous(ReachAvoidProblem):
@@ -92,7 +93,8 @@ class Rendezvous(ReachAvoidProblem):
 
     def target_constraints(self, x: Tensor) -> Tensor:
         px, py, vx, vy = x.unbind(-1)
-        return rows(px.abs() - 1, (py + 2).abs() - 1, vx.abs() - 0.2, vy.abs() - 0.2)
+        near, slow = rows(px - 1, -1 - px, py + 1, -3 - py), rows(vx - 0.2, -0.2 - vx, vy - 0.2, -0.2 - vy)
+        return torch.cat([near, slow], -1)
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
-        return -x[..., 1:2] - x[..., :1].abs()
+        return rows(-x[..., 1] - x[..., 0], x[..., 0] - x[..., 1])

@@ -52,7 +52,8 @@ class Rooms(ReachAvoidProblem):
         return constant(x, [0.2, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 0.5])
 
     def target_constraints(self, x: Tensor) -> Tensor:
-        return torch.cat([20 - x[..., :2], x[..., :2] - 23], -1)
+        first, second = x[..., 0], x[..., 1]
+        return rows(20 - first, first - 23, 20 - second, second - 23)
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
         return x.new_tensor([25.0, 25.0, 75.0]) - x

@@ -32,7 +32,7 @@ class Duffing(ReachAvoidProblem):
         return rows(0.7 - p, p - 1.3, v - 0.4, -0.4 - v)
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
-        return 1.2 - x[..., 1:].abs()
+        return rows(1.2 - x[..., 1], 1.2 + x[..., 1])
 
 
 class MountainCar(ReachAvoidProblem):
@@ -69,4 +69,5 @@ class Swingup(ReachAvoidProblem):
         return constant(x, [0.0], [1.0])
 
     def target_constraints(self, x: Tensor) -> Tensor:
-        return rows(math.cos(0.3) - torch.cos(x[..., 0]), x[..., 1].abs() - 1)
+        angle, speed = x.unbind(-1)
+        return rows(math.cos(0.3) - torch.cos(angle), speed - 1, -1 - speed)
