@@ -344,13 +344,12 @@ def test_more_controls_take_fewer_points():
 def test_where_candidates_are_simulated_the_points_are_fewer():
     """With three controls and five levels, each point needs 15 cubatures, or 15 paths of two steps.
 
-    With seven levels, the choices of an actor for example, it needs 21 cubatures. The four ends of one count as two
-    steps.
+    With seven levels, the choices of an actor for example, it needs 21 cubatures. The four ends of one count as a step.
     """
     problem = Steered(controlled=True)
     simulator = Simulator(problem, 0.1)
-    assert BestControl(problem, simulator, budget=10 * 30 + 29).most_points(groups=3, levels=5) == 10
-    assert BestControl(problem, simulator, budget=10 * 42 + 41).most_points(groups=3, levels=7) == 10
+    assert BestControl(problem, simulator, budget=10 * 15 + 14).most_points(groups=3, levels=5) == 10
+    assert BestControl(problem, simulator, budget=10 * 21 + 20).most_points(groups=3, levels=7) == 10
     assert BestControl(problem, simulator, steps=2, budget=10 * 30 + 29).most_points(groups=3, levels=5) == 10
 
 

@@ -34,8 +34,9 @@ exact, and the best of many nearly equal levels would change with each small cha
 STRIDE, NEAR = 4, 0.15
 """How a cubature looks for the best of `FINE_LEVELS` levels.
 
-Every fourth is tried, and then those between the best and its neighbours. Inertia counts from this distance on: between
-the bounds the objective is flat about its maximum, and inertia would stop an actor before it.
+Every fourth is tried, and then those between the best and its neighbours; for the budget all levels count. Inertia
+counts from the distance 0.15 on: between the bounds the objective is flat about its maximum, and inertia would stop an
+actor before it.
 """
 
 
@@ -75,7 +76,7 @@ class BestControl(ActorRule):
         budget: the largest number of points times controls; of more points the first are taken, so that an update of
             the actor does not cost more with more controls. Where candidates are simulated, it is the largest number of
             simulated states. Each level of each control at each point then needs `steps` of them for a look ahead, and
-            w for the cubature with w noise channels: each of its 2w ends counts as a half, since it needs V alone.
+            w/2 for the cubature with w noise channels: each of its 2w ends counts as a quarter, since it needs V alone.
         inertia: what a level loses for each unit of its distance from the actor's output when levels are compared, as a
             share of the range of the Hamiltonian, >= 0; see `pirl_rl.ascent.improved`. Where noise grows with |u|, both
             bounds are good beside a convex obstacle, and the worst control lies between them. Without inertia the
@@ -109,7 +110,7 @@ class BestControl(ActorRule):
         self.controlled_noise, self.compiles_whole = simulator.controlled_noise, steps == 0
         channels, self.budget = noise_channels(problem), budget
         self.cubature = steps == 0 and self.controlled_noise and channels * problem.controls.dim <= 64
-        self.simulated = steps or (channels if self.cubature else 0)
+        self.simulated = steps or (channels / 2 if self.cubature else 0)
         self.flow: Flow = simulator.flow
 
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
@@ -121,8 +122,7 @@ class BestControl(ActorRule):
             levels = torch.linspace(-1, 1, self.levels, dtype=like.dtype, device=like.device).unsqueeze(-1)
         fine = self.cubature and levels.shape == (FINE_LEVELS, 1)
         stride, near = (STRIDE, NEAR) if fine else (1, 0.0)
-        tried = len(levels[::stride]) + 2 * (stride - 1)
-        most = self.most_points(solution.problem.controls.dim // levels.shape[1], tried)
+        most = self.most_points(solution.problem.controls.dim // levels.shape[1], len(levels))
         tau, x = points["tau"][:most], points["state"][:most]
         logits = actor.logits(tau, x)
         with torch.no_grad():
