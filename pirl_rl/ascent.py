@@ -191,7 +191,7 @@ def ascend(objective: Objective, action: Tensor, levels: Tensor, sweeps: int = 1
 
 
 def improved(
-    objective: Objective, action: Tensor, levels: Tensor, inertia: float = 0.0, near: float = 0.0, stride: int = 1
+    objective: Objective, action: Tensor, levels: Tensor, inertia: float = 0.0, stride: int = 1
 ) -> tuple[Tensor, Tensor]:
     """The best level of each coordinate while the others stand still, for all coordinates in one call of the objective.
 
@@ -211,7 +211,6 @@ def improved(
         levels: the levels (k,) of each coordinate in rising order, bounds included, or the combinations (K, s) of
             levels of each s coordinates in a row.
         inertia: that share, >= 0.
-        near: the distance up to which a level loses nothing, and from which its distance counts, >= 0.
         stride: with a number above 1, which divides k - 1, every such level is tried first, and then those between the
             best of them and its neighbours, of which there are 2 (stride - 1). Only for levels of single coordinates.
 
@@ -232,14 +231,14 @@ def improved(
 
     options = levels[::stride, None].expand(groups, -1, len(action), -1)
     values = tried(options)
-    index, stakes = _preferred(values, before, options, parts, inertia, near)
+    index, stakes = _preferred(values, before, options, parts, inertia)
     if stride > 1:
         steps = torch.arange(1, stride, device=action.device)
         beside = torch.cat([-steps, steps]).unsqueeze(-1)
         between = levels[(stride * index.unsqueeze(1) + beside).clamp(0, len(levels) - 1)]
         options = torch.cat([options, between], 1)
         values = torch.cat([values, tried(between)], 1)
-        index, stakes = _preferred(values, before, options, parts, inertia, near)
+        index, stakes = _preferred(values, before, options, parts, inertia)
     top = values.gather(1, index.unsqueeze(1)).squeeze(1)
     chosen = options.gather(1, index[:, None, :, None].expand(-1, -1, -1, size)).squeeze(1)
     together = torch.where((top > before).unsqueeze(-1), chosen, parts).movedim(0, -2).flatten(-2)
@@ -249,9 +248,7 @@ def improved(
     return best, stakes.mT
 
 
-def _preferred(
-    values: Tensor, before: Tensor, options: Tensor, parts: Tensor, inertia: float, near: float
-) -> tuple[Tensor, Tensor]:
+def _preferred(values: Tensor, before: Tensor, options: Tensor, parts: Tensor, inertia: float) -> tuple[Tensor, Tensor]:
     """The best option of each group after inertia (groups, N), and the range of the values (groups, N).
 
     Args:
@@ -259,10 +256,10 @@ def _preferred(
         before: the value (N,) of the given action.
         options: (groups, k, N, s).
         parts: the coordinates of the given action (groups, N, s).
-        inertia, near: see `improved`.
+        inertia: see `improved`.
     """
     stakes = torch.maximum(values.amax(1), before) - torch.minimum(values.amin(1), before)
-    distance = ((options - parts.unsqueeze(1)).abs().amax(-1) - near).clamp(min=0)
+    distance = (options - parts.unsqueeze(1)).abs().amax(-1)
     return (values - inertia * stakes.unsqueeze(1) * distance).argmax(1), stakes
 
 

@@ -282,18 +282,6 @@ def test_inertia_does_not_matter_where_the_objective_is_affine():
     assert torch.equal(improved(objective, start, levels, 0.1)[0], improved(objective, start, levels)[0])
 
 
-def test_inertia_stops_an_action_before_the_maximum_unless_near_levels_are_free():
-    """f(a) = -a^2 from 0.3: with inertia 0.1 the best of f - 0.1 |a - 0.3| lies at 0.05, and without it at 0."""
-    start, levels = torch.tensor([[0.3]]), torch.linspace(-1, 1, 401)
-
-    def objective(action):
-        return -action.square().squeeze(-1)
-
-    assert improved(objective, start, levels, 0.1)[0].item() == pytest.approx(0.05, abs=1e-6)
-    assert improved(objective, start, levels, 0.1, near=0.3)[0].item() == pytest.approx(0.0, abs=1e-6)
-    assert improved(objective, start, levels, 0.1, near=0.1)[0].item() == pytest.approx(0.05, abs=1e-6)
-
-
 @pytest.mark.parametrize("inertia", [0.0, 0.1])
 def test_every_fourth_level_leads_to_the_best_of_all_where_there_is_one_maximum(inertia):
     """f(a) = -(a_1 - c)^2 + a_1 a_2 / 4 - 2 |a_2 - d|, which is concave in each coordinate."""

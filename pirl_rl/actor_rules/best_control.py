@@ -31,12 +31,10 @@ from forwards to backwards. Where sigma depends on u, levels are compared by sec
 exact, and the best of many nearly equal levels would change with each small change of V.
 """
 
-STRIDE, NEAR = 4, 0.15
-"""How a cubature looks for the best of `FINE_LEVELS` levels.
+STRIDE = 4
+"""Of `FINE_LEVELS` levels a cubature tries every fourth, and then those between the best and its neighbours.
 
-Every fourth is tried, and then those between the best and its neighbours; for the budget all levels count. Inertia
-counts from the distance 0.15 on: between the bounds the objective is flat about its maximum, and inertia would stop an
-actor before it.
+All of them count for the budget.
 """
 
 
@@ -64,7 +62,7 @@ class BestControl(ActorRule):
     Iteration, and Distributed Reinforcement Learning, 2020).
 
     Each coordinate takes its best level while the others stand still, see `pirl_rl.ascent.improved`. Of many levels a
-    cubature does not try all, see `STRIDE` and `NEAR`.
+    cubature does not try all, see `STRIDE`.
 
     Args:
         problem: the physics.
@@ -120,8 +118,7 @@ class BestControl(ActorRule):
             levels = choice.combinations(like)
         else:
             levels = torch.linspace(-1, 1, self.levels, dtype=like.dtype, device=like.device).unsqueeze(-1)
-        fine = self.cubature and levels.shape == (FINE_LEVELS, 1)
-        stride, near = (STRIDE, NEAR) if fine else (1, 0.0)
+        stride = STRIDE if self.cubature and levels.shape == (FINE_LEVELS, 1) else 1
         most = self.most_points(solution.problem.controls.dim // levels.shape[1], len(levels))
         tau, x = points["tau"][:most], points["state"][:most]
         logits = actor.logits(tau, x)
@@ -130,7 +127,7 @@ class BestControl(ActorRule):
             objective = self._objective(solution, tau.squeeze(-1), x)
             usual = CHOICE_INERTIA if choice and not self.controlled_noise else INERTIA
             inertia = usual if self.inertia is None else self.inertia
-            best, weight = improved(objective, action, levels, inertia, near, stride)
+            best, weight = improved(objective, action, levels, inertia, stride)
         if choice:
             scores = choice.grouped(logits).movedim(-1, 1)
             entropy = torch.nn.functional.cross_entropy(scores, choice.indices(best), reduction="none")
