@@ -1,6 +1,7 @@
 """Where the time of a training goes: the share of each part of real updates, without and with the physics.
 
     python benchmarks/training_profile.py [--experiments reach1d quadrotor] [--updates 300] [--json FILE] [key=value]
+    python benchmarks/training_profile.py --experiments own env.problem._target_=benchmarks.kinds.FastCharge
 
 Each experiment is trained with the default recipe and `key=value` settings for `--updates` updates after a first
 hundred, in which everything is compiled. Times are those of one call without the calls inside it, so that the rows add
@@ -22,6 +23,7 @@ import torch
 from benchmarks.record import save
 from pirl_rl.assembly import make_trainer
 from pirl_rl.commands.composition import compose
+from pirl_rl.commands.console import named_modules
 from pirl_rl.evaluation import evaluate
 from pirl_rl.trainer import Trainer
 
@@ -94,7 +96,8 @@ def loop(trainer: Trainer, updates: int) -> None:
 
 def measure(experiment: str, settings: list[str], updates: int) -> dict[str, Any]:
     started = time.perf_counter()
-    trainer = make_trainer(compose("train", [f"+experiment={experiment}", "device=cpu", "logger=none", *settings]))
+    config = compose("train", [f"+experiment={experiment}", "device=cpu", "logger=none", *settings])
+    trainer = make_trainer(config, trust=named_modules(settings))
     trainer._enter_stage()
     trainer.collector.start()
     loop(trainer, 1)
