@@ -212,6 +212,7 @@ class Simulator:
         """The numbers of constraints of A and of B whose crossings are drawn."""
         problem = self.problem
         x = problem.states.sample(2, torch.Generator().manual_seed(0))
+        # Also without a bridge: the problem looks for an overlap of its sets, which must not happen in compiled code.
         target = problem.reached_constraints(x).shape[-1] if problem.objective == "reach-avoid" else 0
         avoid = problem.avoid_constraints(x).shape[-1] if problem.has_avoid_set else 0
         return (target, avoid) if self.crossing == "bridge" else (0, 0)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pirl_rl.errors import ProblemError
-from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.problem import WIDER, ReachAvoidProblem
 
 ROUNDING = 1e-9
 """The relative difference from an affine drift, in double precision, that counts as rounding."""
@@ -77,12 +77,11 @@ def _is_affine_between(problem: ReachAvoidProblem, x: Tensor, one: Tensor, other
     return bool((gap <= ROUNDING * expected.abs().amax(0)).all())
 
 
-def check_problem(problem: ReachAvoidProblem, seed: int = 0) -> None:
+def check_problem(problem: ReachAvoidProblem) -> None:
     """Refuse a problem whose parts are missing, have wrong shapes, or contradict each other.
 
     Args:
         problem: the problem to check.
-        seed: the seed of the random states and controls at which its methods are called.
 
     Raises:
         ProblemError: an attribute is missing, the horizon is not positive or not finite, a control is periodic, names
@@ -101,8 +100,8 @@ def check_problem(problem: ReachAvoidProblem, seed: int = 0) -> None:
         names = getattr(problem, attribute)
         if names and (isinstance(names, str) or [type(entry) for entry in names] != [str] * box.dim):
             raise ProblemError(f"{name}.{attribute}: expected {box.dim} names, got {names!r}")
-    rng = torch.Generator().manual_seed(seed)
-    x = problem.states.expand(1.5).sample(PERIOD_POINTS, rng, dtype=torch.float64)
+    rng = torch.Generator().manual_seed(0)
+    x = problem.states.expand(WIDER).sample(PERIOD_POINTS, rng, dtype=torch.float64)
     u = problem.controls.sample(16, rng, dtype=torch.float64)
     few, n = x[:16], problem.states.dim
     _expect_shape(f"{name}.drift", problem.drift(few, u), (16, n))
