@@ -11,7 +11,7 @@ from pirl_rl.errors import ArgumentError, ConfigError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
 from pirl_rl.structure import check_problem, noise_channels
-from pirl_rl.switching import control_levels, coordinates_together
+from pirl_rl.switching import actor_choices, coordinates_together
 from pirl_rl.time_steps import check_time_steps, propose_time_steps
 
 AUTO = "auto"
@@ -89,9 +89,9 @@ def choose_updates(config: DictConfig, problem: ReachAvoidProblem) -> None:
 def choose_choices(config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[str] = ()) -> None:
     """Replace `auto` in actor.choices and actor.together by numbers that follow from the problem.
 
-    There are choices where the Hamiltonian is not affine in the control, see `pirl_rl.switching`. There are none where
-    a rule of the run, or of one of its stages, needs the gradient of the policy, or looks ahead: a control that is held
-    for long cannot make up for a coarse level by switching to the next.
+    `pirl_rl.switching.actor_choices` says where an actor chooses, and among how many levels. It does not where a rule
+    of the run, or of one of its stages, needs the gradient of the policy, or looks ahead: a control that is held for
+    long cannot make up for a coarse level by switching to the next.
 
     Args:
         config: the configuration of a run.
@@ -101,8 +101,7 @@ def choose_choices(config: DictConfig, problem: ReachAvoidProblem, trust: Sequen
     if not isinstance(config.actor, DictConfig):
         return
     if config.actor.get("choices") == AUTO:
-        levels = control_levels(problem)
-        config.actor.choices = levels if levels > 2 and _all_suit_choices(config, trust) else None
+        config.actor.choices = actor_choices(problem) if _all_suit_choices(config, trust) else None
     if config.actor.get("together") == AUTO:
         choices = config.actor.get("choices")
         config.actor.together = coordinates_together(problem, choices) if isinstance(choices, int) else 1

@@ -30,7 +30,7 @@ from pirl_rl.problems import PlanarQuadrotor, Reach1D, VehicleDrift, VehicleDrif
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 from pirl_rl.structure import has_controlled_noise
-from pirl_rl.switching import COARSE, JOINT, candidate_controls, control_levels, switching
+from pirl_rl.switching import COARSE, JOINT, actor_choices, candidate_controls, control_levels, switching
 
 
 class Steered(ReachAvoidProblem):
@@ -446,6 +446,16 @@ def test_how_the_best_control_changes(problem, joint, coarse):
         found = switching(problem, seed)
         assert (found.joint > JOINT) == joint
         assert (found.coarseness > COARSE) == coarse
+
+
+@pytest.mark.parametrize(
+    ("problem", "choices"),
+    [(Steered(), None), (Bicycle(), 5), (Gusty(), 5), (Sprint(), 33), (Investor(), None)],
+    ids=lambda value: type(value).__name__,
+)
+def test_where_an_actor_chooses(problem, choices):
+    """Among all problems whose Hamiltonian is not affine in u but those whose strength of noise lies between bounds."""
+    assert actor_choices(problem) == choices
 
 
 @pytest.mark.parametrize(
