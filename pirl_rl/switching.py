@@ -73,10 +73,13 @@ def actor_choices(problem: ReachAvoidProblem) -> int | None:
     """The number of levels among which an actor chooses for each coordinate of the control, or None for a tangent.
 
     An actor chooses where the Hamiltonian is not affine in u, so that it jumps over controls that are worse than those
-    on both sides. It does not where sigma depends on u and the best control often lies between the bounds. There the
-    second derivatives of V follow the policy, which follows them: V is nearly straight where the noise of the policy is
-    strong, and bends where it is weak. The best control changes many times in a training, and an actor that chooses
-    ends on one of these levels in some places, a tangent at a mean of them, which a concave Hamiltonian prefers.
+    on both sides. It does not where sigma depends on u and the best control often lies between the bounds. There V is
+    nearly straight where the policy makes strong noise, and bends where it makes weak noise, and the best control in
+    turn depends on how V bends. So the best control at a state changes many times in a training. An actor that chooses
+    ends at one of these controls, and a tangent at their mean, which is better where the Hamiltonian is concave in u.
+
+    Args:
+        problem: the physics.
     """
     levels = control_levels(problem)
     if levels == 2 or (levels == FINE_LEVELS and has_controlled_noise(problem)):

@@ -454,7 +454,7 @@ def test_how_the_best_control_changes(problem, joint, coarse):
     ids=lambda value: type(value).__name__,
 )
 def test_where_an_actor_chooses(problem, choices):
-    """Among all problems whose Hamiltonian is not affine in u but those whose strength of noise lies between bounds."""
+    """An actor chooses where the best control jumps; not where it is a bound, nor where it is a strength of noise."""
     assert actor_choices(problem) == choices
 
 
