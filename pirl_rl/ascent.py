@@ -12,7 +12,7 @@ where the maximum is a vertex of the box of controls. Unlike steps along a gradi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -54,18 +54,22 @@ def hamiltonian(solution: Solution, tau: Tensor, x: Tensor, controlled_noise: bo
     return value
 
 
-def expected_ahead(solution: Solution, tau: Tensor, x: Tensor, length: float) -> Objective:
+def expected_ahead(
+    solution: Solution, tau: Tensor, x: Tensor, length: float, channels: Sequence[int] | None = None
+) -> Objective:
     """E V (*, N) after one Euler step with the action (*, N, m), by a cubature of degree three, Eq. (cubature).
 
-    The mean over y = x + f h +- sqrt(w h) sigma_k, for the w columns of sigma, has the mean and the covariance of the
-    step. It is bounded where a second derivative is not: next to a face V may change within one step, and there the
-    learned curvature may be of any size and sign. V is continued into A and B, see `continued_value`.
+    The mean over y = x + f h +- sqrt(w h) sigma_k, for w columns of sigma, has the mean and the covariance of the step.
+    It is bounded where a second derivative is not: next to a face V may change within one step, and there the learned
+    curvature may be of any size and sign. V is continued into A and B, see `continued_value`.
 
     Args:
         solution: gives V, with its values in A and B, and the problem.
         tau: times to go (N,), in s.
         x: states (N, n).
         length: h in s; it is shortened to tau.
+        channels: the columns of sigma, at least one; None takes all of them. The effect of a column that does not
+            depend on the action adds the same to all actions, to first order in h.
     """
     problem, h = solution.problem, tau.clamp(max=length)
 
@@ -73,6 +77,7 @@ def expected_ahead(solution: Solution, tau: Tensor, x: Tensor, length: float) ->
         u, shape = problem.controls.denormalize(action), action.shape[:-1]
         y = x.expand(*shape, -1)
         sigma = problem.diffusion(y, u).movedim(-1, 0)
+        sigma = sigma if channels is None else torch.stack([sigma[k] for k in channels])
         spread = sigma * (len(sigma) * h).sqrt().unsqueeze(-1)
         ends = y + problem.drift(y, u) * h.unsqueeze(-1) + torch.cat([spread, -spread])
         return continued_value(solution, (tau - h).expand(ends.shape[:-1]), ends).mean(0)
@@ -191,7 +196,12 @@ def ascend(objective: Objective, action: Tensor, levels: Tensor, sweeps: int = 1
 
 
 def improved(
-    objective: Objective, action: Tensor, levels: Tensor, inertia: float = 0.0, stride: int = 1
+    objective: Objective,
+    action: Tensor,
+    levels: Tensor,
+    inertia: float = 0.0,
+    stride: int = 1,
+    tried: Sequence[int] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """The best level of each coordinate while the others stand still, for all coordinates in one call of the objective.
 
@@ -213,39 +223,43 @@ def improved(
         inertia: that share, >= 0.
         stride: with a number above 1, which divides k - 1, every such level is tried first, and then those between the
             best of them and its neighbours, of which there are 2 (stride - 1). Only for levels of single coordinates.
+        tried: the numbers of the groups that may change, counted from 0; None lets all of them.
 
     Returns:
-        The action (N, m), whose objective is at least that of the given one, and how much each group matters
-        (N, m / s): the range of the objective over the levels that were tried and the given action.
+        The action (N, m), whose objective is at least that of the given one, and how much each group that may change
+        matters (N, g): the range of the objective over the levels that were tried and the given action.
     """
     levels = levels.reshape(len(levels), -1)
     size = levels.shape[1]
     groups = action.shape[-1] // size
-    own = torch.eye(groups, dtype=torch.bool, device=action.device).repeat_interleave(size, 1)
-    parts = action.unflatten(-1, (groups, size)).movedim(-2, 0)  # (groups, N, s)
+    own = torch.eye(groups, dtype=torch.bool, device=action.device).repeat_interleave(size, 1)  # (g, m)
+    parts = action.unflatten(-1, (groups, size)).movedim(-2, 0)  # (g, N, s)
+    if tried is not None:
+        own, parts = (torch.stack([entries[i] for i in tried]) for entries in (own, parts))
     before = objective(action)
 
-    def tried(options: Tensor) -> Tensor:
-        """The objective (groups, k, N) of options (groups, k, N, s), each with the other groups at the action."""
-        return objective(torch.where(own[:, None, None], options.repeat(1, 1, 1, groups), action))
+    def placed(options: Tensor) -> Tensor:
+        """Actions (g, *, N, m), each with an option (g, *, N, s) of its group and the others at the given action."""
+        where = own.reshape(len(own), *[1] * (options.ndim - 2), -1)
+        return torch.where(where, options.repeat(*[1] * (options.ndim - 1), groups), action)
 
-    options = levels[::stride, None].expand(groups, -1, len(action), -1)
-    values = tried(options)
+    options = levels[::stride, None].expand(len(own), -1, len(action), -1)
+    values = objective(placed(options))
     index, stakes = _preferred(values, before, options, parts, inertia)
     if stride > 1:
         steps = torch.arange(1, stride, device=action.device)
         beside = torch.cat([-steps, steps]).unsqueeze(-1)
         between = levels[(stride * index.unsqueeze(1) + beside).clamp(0, len(levels) - 1)]
         options = torch.cat([options, between], 1)
-        values = torch.cat([values, tried(between)], 1)
+        values = torch.cat([values, objective(placed(between))], 1)
         index, stakes = _preferred(values, before, options, parts, inertia)
     top = values.gather(1, index.unsqueeze(1)).squeeze(1)
-    chosen = options.gather(1, index[:, None, :, None].expand(-1, -1, -1, size)).squeeze(1)
-    together = torch.where((top > before).unsqueeze(-1), chosen, parts).movedim(0, -2).flatten(-2)
+    best = options.gather(1, index[:, None, :, None].expand(-1, -1, -1, size)).squeeze(1)
     alone, which = top.max(0)
-    single = torch.where(own[which], together, action)
-    best = torch.where((objective(together) >= alone).unsqueeze(-1), together, single)
-    return best, stakes.mT
+    moved = placed(torch.where((top > before).unsqueeze(-1), best, parts))
+    together = torch.where(own.any(0), torch.where(own.unsqueeze(1), moved, 0).sum(0), action)
+    single = moved.take_along_dim(which[None, :, None], 0).squeeze(0)
+    return torch.where((objective(together) >= alone).unsqueeze(-1), together, single), stakes.mT
 
 
 def _preferred(values: Tensor, before: Tensor, options: Tensor, parts: Tensor, inertia: float) -> tuple[Tensor, Tensor]:

@@ -35,6 +35,26 @@ def has_controlled_noise(problem: ReachAvoidProblem, points: int = 256, seed: in
     return not torch.equal(one, other)
 
 
+def controlled_channels(problem: ReachAvoidProblem, points: int = 256, seed: int = 0) -> list[list[int]]:
+    """For each coordinate of u the numbers of the columns of sigma that depend on it.
+
+    Args:
+        problem: the physics.
+        points: the number of random states, each with two controls that differ in the coordinate alone.
+        seed: of the points.
+    """
+    rng = torch.Generator().manual_seed(seed)
+    x = problem.states.sample(points, rng)
+    one, drawn = (problem.controls.sample(points, rng) for _ in range(2))
+    sigma, found = problem.diffusion(x, one), []
+    for axis in range(problem.controls.dim):
+        other = one.clone()
+        other[:, axis] = drawn[:, axis]
+        changed = (problem.diffusion(x, other) != sigma).any(0).any(0)
+        found.append(changed.nonzero().squeeze(-1).tolist())
+    return found
+
+
 def is_control_affine(problem: ReachAvoidProblem, points: int = 256, seed: int = 0) -> bool:
     """Whether the drift is affine in u and sigma does not depend on u, judged at random states and controls.
 

@@ -29,7 +29,7 @@ from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.problems import PlanarQuadrotor, Reach1D, VehicleDrift, VehicleDrift3
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
-from pirl_rl.structure import has_controlled_noise
+from pirl_rl.structure import controlled_channels, has_controlled_noise
 from pirl_rl.switching import COARSE, JOINT, actor_choices, candidate_controls, control_levels, switching
 
 
@@ -109,6 +109,9 @@ class Quadratic:
     def value(self, tau: Tensor, x: Tensor) -> Tensor:
         return tau + (x @ self.M * x).sum(-1) / 2
 
+    def gradient(self, tau: Tensor, x: Tensor) -> Tensor:
+        return x @ self.M
+
 
 def test_the_cubature_is_exact_for_a_quadratic_value():
     """E V = tau - h + m' M m / 2 + h Tr(sigma' M sigma) / 2 with m = x + f h, where h is at most tau."""
@@ -122,6 +125,49 @@ def test_the_cubature_is_exact_for_a_quadratic_value():
     expected = Quadratic(problem).value(tau - h, mean) + h * trace / 2
     found = expected_ahead(Quadratic(problem), tau, x, 0.3)(action)  # type: ignore[arg-type]
     assert torch.allclose(found, expected, atol=1e-5)
+
+
+class Actuators(ReachAvoidProblem):
+    """dx_1 = (u_2 + u_3) dt + 0.2 dW_1 and dx_2 = u_1 dt + (0.3 + u_1^2) dW_2 + (0.4 + u_2/2) dW_3.
+
+    The target is far away.
+    """
+
+    horizon = 1.0
+    states, controls = Box([-1.0, -1.0], [1.0, 1.0]), Box([-1.0, -0.5, -1.0], [0.5, 1.0, 1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.stack([u[..., 1] + u[..., 2], u[..., 0]], -1)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        own, other = 0.3 + u[..., 0].square(), 0.4 + 0.5 * u[..., 1]
+        still, zero = torch.full_like(own, 0.2), torch.zeros_like(own)
+        return torch.stack([torch.stack([still, zero, zero], -1), torch.stack([zero, own, other], -1)], -2)
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return 100.0 - x[..., 0]
+
+
+def test_each_coordinate_of_the_control_is_judged_with_the_noise_that_depends_on_it():
+    """H is a sum of functions of one coordinate each, so that the best levels are those of the largest generator."""
+    problem = Actuators()
+    rule = BestControl(problem, Simulator(problem, 0.01), levels=5, inertia=0.0)
+    assert controlled_channels(problem) == [[1], [2], []]
+    assert rule.blocks(1) == {(1,): [0], (2,): [1], (): [2]}
+    tau, x = points(problem, 50)
+    solution, levels = Quadratic(problem), torch.linspace(-1, 1, 5).unsqueeze(-1)
+    best, weight = rule._improved(solution, tau, x, torch.zeros(50, 3), levels, 0.0)  # type: ignore[arg-type]
+    actions = torch.tensor(list(itertools.product(levels.squeeze(-1).tolist(), repeat=3))).unsqueeze(1)
+    u = problem.controls.denormalize(actions)
+    slope, sigma = solution.gradient(tau, x), problem.diffusion(x, u)
+    trace = (sigma * (Quadratic.M @ sigma)).sum((-2, -1))
+    generator = ((problem.drift(x, u) * slope).sum(-1) + trace / 2).reshape(5, 5, 5, 50)
+    expected = torch.stack(
+        [generator.amax((1, 2)).argmax(0), generator.amax((0, 2)).argmax(0), generator.amax((0, 1)).argmax(0)], -1
+    )
+    assert torch.equal(best, levels.squeeze(-1)[expected])
+    ranges = torch.stack([generator.amax(i) - generator.amin(i) for i in range(3)])
+    torch.testing.assert_close(weight.mT, ranges[:, 0, 0], rtol=0.02, atol=0.02)
 
 
 class Channel(ReachAvoidProblem):
@@ -265,6 +311,14 @@ def test_groups_of_coordinates_are_improved_at_once():
     assert torch.allclose(stakes, torch.tensor([[2.6, 4.0]]))
 
 
+def test_coordinates_that_are_not_tried_stand_still():
+    """f is the sum of the coordinates: those that are tried go to 1, each with a range of 2."""
+    start = torch.tensor([[0.5, -0.3, 0.1], [0.0, 0.0, -1.0]])
+    best, stakes = improved(lambda a: a.sum(-1), start, torch.tensor([-1.0, 1.0]), tried=[2, 0])
+    assert torch.equal(best, torch.stack([torch.ones(2), start[:, 1], torch.ones(2)], -1))
+    assert torch.allclose(stakes, torch.full((2, 2), 2.0))
+
+
 @pytest.mark.parametrize(("tilt", "inertia", "expected"), [(0.05, 0.0, 1.0), (0.05, 0.1, -1.0), (0.5, 0.1, 1.0)])
 def test_inertia_decides_between_levels_that_are_nearly_as_good(tilt, inertia, expected):
     """f(a) = |a| + tilt a from -0.8: the penalty of the bound 1 exceeds that of -1 by 0.1 * 1.6 of the range."""
@@ -330,15 +384,17 @@ def test_more_controls_take_fewer_points():
 
 
 def test_where_candidates_are_simulated_the_points_are_fewer():
-    """With three controls and five levels, each point needs 15 cubatures, or 15 paths of two steps.
+    """With three controls and five levels, each point needs 15 paths of two steps.
 
-    With seven levels, the choices of an actor for example, it needs 21 cubatures. The four ends of one count as a step.
+    Or it needs five cubatures, whose four ends count as a step, for the only control on which the noise depends, and
+    one unit for each of the others. With seven levels, the choices of an actor for example, it needs seven cubatures.
     """
     problem = Steered(controlled=True)
     simulator = Simulator(problem, 0.1)
-    assert BestControl(problem, simulator, budget=10 * 15 + 14).most_points(groups=3, levels=5) == 10
-    assert BestControl(problem, simulator, budget=10 * 21 + 20).most_points(groups=3, levels=7) == 10
-    assert BestControl(problem, simulator, steps=2, budget=10 * 30 + 29).most_points(groups=3, levels=5) == 10
+    five, seven = (torch.linspace(-1, 1, count).unsqueeze(-1) for count in (5, 7))
+    assert BestControl(problem, simulator, budget=10 * 7 + 6).most_points(five) == 10
+    assert BestControl(problem, simulator, budget=10 * 9 + 8).most_points(seven) == 10
+    assert BestControl(problem, simulator, steps=2, budget=10 * 30 + 29).most_points(five) == 10
 
 
 @pytest.mark.parametrize("controlled", [False, True])

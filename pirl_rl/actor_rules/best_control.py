@@ -17,7 +17,7 @@ from pirl_rl.operators import masked_mean
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
-from pirl_rl.structure import noise_channels
+from pirl_rl.structure import controlled_channels, noise_channels
 from pirl_rl.switching import FINE_LEVELS, LEVELS, control_levels
 
 INERTIA = 0.1
@@ -37,6 +37,9 @@ STRIDE = 4
 All of them count for the budget.
 """
 
+MOST_PAIRS = 64
+"""The largest number of noise channels times controls for which the noise of a step is simulated."""
+
 
 class BestControl(ActorRule):
     """The negative mean of T sum_i w_i CE((1 + a_i)/2, (1 + pi_i)/2) over points, Eq. (best_control).
@@ -52,9 +55,11 @@ class BestControl(ActorRule):
     cross-entropy of its scores, -log softmax(scores)_j for the best level j. Where it chooses several coordinates
     together, j is the best of all combinations of their levels, and w_i the range of the Hamiltonian over these.
 
-    Where sigma depends on u, E V after one control step takes the place of the Hamiltonian, divided by dt, see
-    `pirl_rl.ascent.expected_ahead`: next to faces the Hessian of a network may have the wrong sign. With more than 64
-    noise channels times controls it would be too dear, and the Hamiltonian stays.
+    For the coordinates of u on which sigma depends, E V after one control step takes the place of the Hamiltonian,
+    divided by dt, see `pirl_rl.ascent.expected_ahead`: next to faces the Hessian of a network may have the wrong sign.
+    The step has the noise of those channels that depend on the coordinate. Coordinates on which the same channels
+    depend take their best levels at once, one block of them after the other. With more noise channels times
+    controls than `MOST_PAIRS` the step would be too dear, and the Hamiltonian stays.
 
     The Hamiltonian is the limit of a control that is never held. Where a control step is long, as with fewer than a
     hundred of them in the horizon, V after `steps` noise-free control steps takes its place, divided by dt: the first
@@ -74,7 +79,8 @@ class BestControl(ActorRule):
         budget: the largest number of points times controls; of more points the first are taken, so that an update of
             the actor does not cost more with more controls. Where candidates are simulated, it is the largest number of
             simulated states. Each level of each control at each point then needs `steps` of them for a look ahead, and
-            w/2 for the cubature with w noise channels: each of its 2w ends counts as a quarter, since it needs V alone.
+            w/2 for a cubature with the noise of w channels: each of its 2w ends counts as a quarter, since it needs V
+            alone.
         inertia: what a level loses for each unit of its distance from the actor's output when levels are compared, as a
             share of the range of the Hamiltonian, >= 0; see `pirl_rl.ascent.improved`. Where noise grows with |u|, both
             bounds are good beside a convex obstacle, and the worst control lies between them. Without inertia the
@@ -106,9 +112,9 @@ class BestControl(ActorRule):
             )
         self.simulator, self.steps, self.levels, self.inertia = simulator, steps, levels, inertia
         self.controlled_noise, self.compiles_whole = simulator.controlled_noise, steps == 0
-        channels, self.budget = noise_channels(problem), budget
-        self.cubature = steps == 0 and self.controlled_noise and channels * problem.controls.dim <= 64
-        self.simulated = steps or (channels / 2 if self.cubature else 0)
+        few = noise_channels(problem) * problem.controls.dim <= MOST_PAIRS
+        self.budget, self.cubature = budget, steps == 0 and self.controlled_noise and few
+        self.channels = controlled_channels(problem)
         self.flow: Flow = simulator.flow
 
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
@@ -118,37 +124,65 @@ class BestControl(ActorRule):
             levels = choice.combinations(like)
         else:
             levels = torch.linspace(-1, 1, self.levels, dtype=like.dtype, device=like.device).unsqueeze(-1)
-        stride = STRIDE if self.cubature and levels.shape == (FINE_LEVELS, 1) else 1
-        most = self.most_points(solution.problem.controls.dim // levels.shape[1], len(levels))
+        most = self.most_points(levels)
         tau, x = points["tau"][:most], points["state"][:most]
         logits = actor.logits(tau, x)
         with torch.no_grad():
             action = actor.layers[-1](logits)
-            objective = self._objective(solution, tau.squeeze(-1), x)
             usual = CHOICE_INERTIA if choice and not self.controlled_noise else INERTIA
-            inertia = usual if self.inertia is None else self.inertia
-            best, weight = improved(objective, action, levels, inertia, stride)
+            best, weight = self._improved(solution, tau.squeeze(-1), x, action, levels, usual)
         if choice:
             scores = choice.grouped(logits).movedim(-1, 1)
             entropy = torch.nn.functional.cross_entropy(scores, choice.indices(best), reduction="none")
         else:
             # pi = tanh(z) is 2 sigmoid(2 z) - 1, so that 2 z is the logit of (1 + pi)/2.
             entropy = torch.nn.functional.binary_cross_entropy_with_logits(2 * logits, (1 + best) / 2, reduction="none")
-        duration = self.simulator.dt if self.steps or self.cubature else 1.0
-        loss = solution.problem.horizon / duration * (weight * entropy).sum(-1)
+        loss = solution.problem.horizon * (weight * entropy).sum(-1)
         mask = points["mask"][:most] if "mask" in points.keys() else torch.ones_like(loss, dtype=torch.bool)
         return -masked_mean(loss, mask)
 
-    def most_points(self, groups: int, levels: int) -> int:
-        """The largest number of points that the budget allows, for so many groups of coordinates with their levels."""
-        return max(1, int(self.budget / (groups * max(1, levels * self.simulated))))
+    def blocks(self, size: int) -> dict[tuple[int, ...], list[int]]:
+        """The groups of `size` coordinates each that take their best levels at once, by the channels of their noise."""
+        groups = len(self.channels) // size
+        if not self.cubature:
+            return {(): list(range(groups))}
+        found: dict[tuple[int, ...], list[int]] = {}
+        for group in range(groups):
+            channels = {k for of_one in self.channels[group * size : (group + 1) * size] for k in of_one}
+            found.setdefault(tuple(sorted(channels)), []).append(group)
+        return found
 
-    def _objective(self, solution: Solution, tau: Tensor, x: Tensor) -> Objective:
+    def most_points(self, levels: Tensor) -> int:
+        """The largest number of points that the budget allows, for levels (k, s) of groups of s coordinates."""
+        count, size = levels.shape
+        blocks = self.blocks(size).items()
+        cost = sum(len(groups) * max(1, count * (self.steps or len(channels) / 2)) for channels, groups in blocks)
+        return max(1, int(self.budget / cost))
+
+    def _improved(
+        self, solution: Solution, tau: Tensor, x: Tensor, action: Tensor, levels: Tensor, inertia: float
+    ) -> tuple[Tensor, Tensor]:
+        """The action (N, m) with the best levels, block by block, and how much each group matters (N, g), in 1/s."""
+        inertia = inertia if self.inertia is None else self.inertia
+        stride = STRIDE if self.cubature and levels.shape == (FINE_LEVELS, 1) else 1
+        blocks, stakes = self.blocks(levels.shape[1]), {}
+        for channels, groups in blocks.items():
+            objective, duration = self._objective(solution, tau, x, channels)
+            tried = groups if len(blocks) > 1 else None
+            action, found = improved(objective, action, levels, inertia, stride, tried)
+            stakes |= dict(zip(groups, (found / duration).unbind(-1), strict=True))
+        return action, torch.stack([stakes[group] for group in sorted(stakes)], -1)
+
+    def _objective(
+        self, solution: Solution, tau: Tensor, x: Tensor, channels: tuple[int, ...]
+    ) -> tuple[Objective, float]:
+        """What is maximised, and its unit in s."""
+        dt = self.simulator.dt
         if self.steps:
-            return value_ahead(solution, self.simulator, tau, x, self.steps, self.flow)
-        if self.cubature:
-            return expected_ahead(solution, tau, x, self.simulator.dt)
-        return hamiltonian(solution, tau, x, self.controlled_noise)
+            return value_ahead(solution, self.simulator, tau, x, self.steps, self.flow), dt
+        if channels:
+            return expected_ahead(solution, tau, x, dt, channels), dt
+        return hamiltonian(solution, tau, x, self.controlled_noise and not self.cubature), 1.0
 
     def check(self, critic: Critic, exploration_noise: float | None = None) -> None:
         if critic.action_input:
