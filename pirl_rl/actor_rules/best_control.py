@@ -58,8 +58,8 @@ class BestControl(ActorRule):
     For the coordinates of u on which sigma depends, E V after one control step takes the place of the Hamiltonian,
     divided by dt, see `pirl_rl.ascent.expected_ahead`: next to faces the Hessian of a network may have the wrong sign.
     The step has the noise of those channels that depend on the coordinate. Coordinates on which the same channels
-    depend take their best levels at once, one block of them after the other. With more noise channels times
-    controls than `MOST_PAIRS` the step would be too dear, and the Hamiltonian stays.
+    depend take their best levels at once, one block of them after the other. With more noise channels times controls
+    than `MOST_PAIRS` the step would be too dear, and the Hamiltonian stays.
 
     The Hamiltonian is the limit of a control that is never held. Where a control step is long, as with fewer than a
     hundred of them in the horizon, V after `steps` noise-free control steps takes its place, divided by dt: the first
@@ -112,9 +112,9 @@ class BestControl(ActorRule):
             )
         self.simulator, self.steps, self.levels, self.inertia = simulator, steps, levels, inertia
         self.controlled_noise, self.compiles_whole = simulator.controlled_noise, steps == 0
-        few = noise_channels(problem) * problem.controls.dim <= MOST_PAIRS
-        self.budget, self.cubature = budget, steps == 0 and self.controlled_noise and few
-        self.channels = controlled_channels(problem)
+        m, self.budget = problem.controls.dim, budget
+        self.cubature = steps == 0 and self.controlled_noise and noise_channels(problem) * m <= MOST_PAIRS
+        self.channels = controlled_channels(problem) if self.cubature else [[]] * m
         self.flow: Flow = simulator.flow
 
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
@@ -143,11 +143,8 @@ class BestControl(ActorRule):
 
     def blocks(self, size: int) -> dict[tuple[int, ...], list[int]]:
         """The groups of `size` coordinates each that take their best levels at once, by the channels of their noise."""
-        groups = len(self.channels) // size
-        if not self.cubature:
-            return {(): list(range(groups))}
         found: dict[tuple[int, ...], list[int]] = {}
-        for group in range(groups):
+        for group in range(len(self.channels) // size):
             channels = {k for of_one in self.channels[group * size : (group + 1) * size] for k in of_one}
             found.setdefault(tuple(sorted(channels)), []).append(group)
         return found
@@ -165,13 +162,16 @@ class BestControl(ActorRule):
         """The action (N, m) with the best levels, block by block, and how much each group matters (N, g), in 1/s."""
         inertia = inertia if self.inertia is None else self.inertia
         stride = STRIDE if self.cubature and levels.shape == (FINE_LEVELS, 1) else 1
-        blocks, stakes = self.blocks(levels.shape[1]), {}
+        blocks, order, stakes = self.blocks(levels.shape[1]), [], []
         for channels, groups in blocks.items():
             objective, duration = self._objective(solution, tau, x, channels)
             tried = groups if len(blocks) > 1 else None
             action, found = improved(objective, action, levels, inertia, stride, tried)
-            stakes |= dict(zip(groups, (found / duration).unbind(-1), strict=True))
-        return action, torch.stack([stakes[group] for group in sorted(stakes)], -1)
+            order, stakes = order + groups, [*stakes, found / duration]
+        weight = torch.cat(stakes, -1)
+        if len(blocks) > 1:
+            weight = torch.stack([weight[:, order.index(group)] for group in sorted(order)], -1)
+        return action, weight
 
     def _objective(
         self, solution: Solution, tau: Tensor, x: Tensor, channels: tuple[int, ...]
