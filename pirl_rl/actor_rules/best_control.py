@@ -130,7 +130,8 @@ class BestControl(ActorRule):
         with torch.no_grad():
             action = actor.layers[-1](logits)
             usual = CHOICE_INERTIA if choice and not self.controlled_noise else INERTIA
-            best, weight = self._improved(solution, tau.squeeze(-1), x, action, levels, usual)
+            inertia = usual if self.inertia is None else self.inertia
+            best, weight = self._improved(solution, tau.squeeze(-1), x, action, levels, inertia)
         if choice:
             scores = choice.grouped(logits).movedim(-1, 1)
             entropy = torch.nn.functional.cross_entropy(scores, choice.indices(best), reduction="none")
@@ -160,7 +161,6 @@ class BestControl(ActorRule):
         self, solution: Solution, tau: Tensor, x: Tensor, action: Tensor, levels: Tensor, inertia: float
     ) -> tuple[Tensor, Tensor]:
         """The action (N, m) with the best levels, block by block, and how much each group matters (N, g), in 1/s."""
-        inertia = inertia if self.inertia is None else self.inertia
         stride = STRIDE if self.cubature and levels.shape == (FINE_LEVELS, 1) else 1
         blocks, order, stakes = self.blocks(levels.shape[1]), [], []
         for channels, groups in blocks.items():
