@@ -23,12 +23,13 @@ from pirl_rl.problems import (
     DubinsCar,
     Exit1D,
     HalfSpace,
+    Pendulum,
     RadialExit,
     Reach1D,
     Safety1D,
     VehicleDrift3,
 )
-from pirl_rl.scoring.truth import DOUBT
+from pirl_rl.scoring.truth import DOUBT, find_truth
 from pirl_rl.structure import is_affine_in
 
 
@@ -428,6 +429,51 @@ def test_a_target_of_several_faces_is_entered_through_all_of_them():
     speed = torch.linspace(-0.25, 0.25, 11, dtype=torch.float64)
     value = solution.value(torch.full((11,), 0.05, dtype=torch.float64), torch.stack([0 * speed + 0.06, speed], -1))
     assert value.max() < 0.02
+
+
+class Landing(ReachAvoidProblem):
+    """Land softly: 0 < height <= 0.2 at a speed of at most 0.8. The noise is weak, and gusts act on the speed alone."""
+
+    horizon = 5.0
+    states, controls = Box([0.0, -3.0], [6.0, 3.0]), Box([0.0], [15.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.stack([x[..., 1], u[..., 0] - 9.81], -1)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return x.new_tensor([[0.0], [0.6]]).expand(*x.shape, 1)
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return torch.stack([x[..., 0] - 0.2, -0.8 - x[..., 1], x[..., 1] - 0.8], -1)
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        return x[..., :1]
+
+
+def test_a_target_of_few_nodes_is_pointed_out_since_the_estimate_misses_its_error():
+    """With 61 nodes two rows are in the target. Its own policy nearly always lands, where the grid finds 0.94."""
+    problem = Landing()
+    with pytest.warns(UserWarning, match="fewer than 4 nodes in a row along an axis with points=\\(61, 61\\)"):
+        solution = GridSolver(problem, points=61).solve()
+    tau, x = torch.full((3,), 3.5, dtype=torch.float64), torch.tensor([[1.0, -1.0], [1.5, 0.0], [3.0, 0.0]]).double()
+    played = monte_carlo(problem, solution.policy, tau, x, rollouts=500, dt=0.01, seed=0).probability
+    assert (played - solution.value(tau, x) > 4 * solution.error(tau, x)).all()
+    assert find_truth(problem, 10, 0, {2: 61}).source == "none"
+
+
+@pytest.mark.parametrize(
+    ("problem", "count", "resolved"),
+    [
+        (Landing(), 91, False),  # rows at 0.07, 0.13 and perhaps 0.2
+        (Landing(), 151, True),
+        (HalfSpace(dim=2), 5, True),  # goes on beyond the mesh
+        (DubinsCar(), 61, True),  # a disc at all headings, which are periodic
+        (DubinsCar(), 13, False),
+        (Pendulum(), 5, True),  # there is no target
+    ],
+)
+def test_a_target_is_resolved_by_four_nodes_in_a_row(problem, count, resolved):
+    assert GridSolver(problem, points=count).resolves_target is resolved
 
 
 def test_extrapolation_lowers_the_error_of_turns():

@@ -56,7 +56,7 @@ def test_the_grid_is_the_truth_where_no_closed_form_is_known(monkeypatch):
 class PartlySure:
     """A grid that vouches for the states with a first coordinate below a bound."""
 
-    bound = 0.0
+    bound, resolves_target = 0.0, True
 
     def __init__(self, problem, points):
         pass

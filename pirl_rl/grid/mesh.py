@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from numpy.lib.stride_tricks import sliding_window_view
 
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
@@ -19,6 +20,13 @@ DEVIATIONS = 3.0
 
 WIDEST = {1: 1.0, 2: 1.0, 3: 0.5}
 """The largest margin on a side, in widths of `states`, by the number of states: in three dimensions it costs most."""
+
+LEAST_ACROSS = 4
+"""The least number of nodes in a row in the target along each axis with which an estimate of the error is trusted.
+
+With half the points two of them are left. A solution with fewer can be as wrong as that with half the points, so that
+their difference is small and says nothing.
+"""
 
 
 class Mesh:
@@ -100,16 +108,39 @@ def make_mesh(problem: ReachAvoidProblem, points: Sequence[int], margin: np.ndar
     Raises:
         ArgumentError: every node lies in A or B.
     """
+    wide = _wide(problem, points, margin)
+    free = ~absorbed(problem, wide.states(wide.indices()))[0].reshape(wide.shape)
+    if not free.any():
+        raise ArgumentError(f"points: expected nodes outside of target and avoid set, got none with points={points}")
+    axes = range(len(wide.shape))
+    first, last = np.zeros(len(axes), int), np.array(wide.shape) - 1
+    for axis in set(axes) - set(wide.periodic):
+        inside = np.flatnonzero(free.any(tuple(other for other in axes if other != axis)))
+        first[axis], last[axis] = max(inside[0] - 1, 0), min(inside[-1] + 1, last[axis])
+    return Mesh(wide.low + first * wide.spacing, wide.spacing, (last - first + 1).tolist(), wide.periodic)
+
+
+def resolves_target(problem: ReachAvoidProblem, points: Sequence[int], margin: np.ndarray) -> bool:
+    """Whether A has `LEAST_ACROSS` nodes in a row along each axis, on the mesh of `make_mesh` before it is cut.
+
+    A target that reaches the edge of that mesh counts as one that goes on beyond it.
+    """
+    if problem.objective != "reach-avoid":
+        return True
+    wide = _wide(problem, points, margin)
+    target = absorbed(problem, wide.states(wide.indices()))[1].reshape(wide.shape) > 0
+    for axis in range(target.ndim):
+        ends = [(LEAST_ACROSS - 1,) * 2 if other == axis else (0, 0) for other in range(target.ndim)]
+        continued = np.pad(target, ends, mode="wrap" if axis in wide.periodic else "edge")
+        if not sliding_window_view(continued, LEAST_ACROSS, axis).all(-1).any():
+            return False
+    return True
+
+
+def _wide(problem: ReachAvoidProblem, points: Sequence[int], margin: np.ndarray) -> Mesh:
+    """The mesh with `points` nodes across `states` along each axis, widened by `margin` (n,) on each side."""
     low, width = np.array(problem.states.low), np.array(problem.states.high) - problem.states.low
     periodic, count = tuple(problem.states.periodic), np.array(points)
     spacing = width / np.where(np.isin(np.arange(len(low)), periodic), count, count - 1)
     extra = np.ceil(margin / spacing - 1e-9).astype(int)
-    wide = Mesh(low - extra * spacing, spacing, (count + 2 * extra).tolist(), periodic)
-    free = ~absorbed(problem, wide.states(wide.indices()))[0].reshape(wide.shape)
-    if not free.any():
-        raise ArgumentError(f"points: expected nodes outside of target and avoid set, got none with points={points}")
-    first, last = np.zeros(len(low), int), np.array(wide.shape) - 1
-    for axis in set(range(len(low))) - set(periodic):
-        inside = np.flatnonzero(free.any(tuple(other for other in range(len(low)) if other != axis)))
-        first[axis], last[axis] = max(inside[0] - 1, 0), min(inside[-1] + 1, last[axis])
-    return Mesh(wide.low + first * spacing, spacing, (last - first + 1).tolist(), periodic)
+    return Mesh(low - extra * spacing, spacing, (count + 2 * extra).tolist(), periodic)

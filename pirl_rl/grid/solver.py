@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,7 +14,7 @@ from pirl_rl.errors import ArgumentError
 from pirl_rl.grid.candidates import candidates
 from pirl_rl.grid.chain import Chain
 from pirl_rl.grid.march import Continuation, March
-from pirl_rl.grid.mesh import Mesh, absorbed, default_margin, make_mesh
+from pirl_rl.grid.mesh import LEAST_ACROSS, Mesh, absorbed, default_margin, make_mesh, resolves_target
 from pirl_rl.grid.solution import GridSolution
 from pirl_rl.grid.transport import FARTHEST, Transport, is_weak, speed_limit
 from pirl_rl.problem import ReachAvoidProblem
@@ -72,6 +73,11 @@ class GridSolver:
             raise ArgumentError(f"margin: expected {n} numbers >= 0, got {margin}")
         self.problem, self.steps, self.levels, self.estimate = problem, steps, levels, estimate
 
+    @property
+    def resolves_target(self) -> bool:
+        """Whether the target is wide enough, in nodes, for an estimate of the error; see `LEAST_ACROSS`."""
+        return resolves_target(self.problem, self.points, self.margin)
+
     @torch.no_grad()
     def solve(self) -> GridSolution:
         """The value and the policy.
@@ -81,6 +87,12 @@ class GridSolver:
         """
         solution = self._solved(self.points)
         if self.estimate:
+            if not self.resolves_target:
+                warnings.warn(
+                    f"points: the target has fewer than {LEAST_ACROSS} nodes in a row along an axis with points="
+                    f"{self.points}, so that the estimate of the error can be far too small; expected more points",
+                    stacklevel=2,
+                )
             half = tuple(max((count + 1) // 2, 3) for count in self.points)
             # Both have the same scheme, or their distance would not be an estimate of the error.
             solution.coarse = self._solved(half, (max(solution.steps // 2, 1), solution.split))

@@ -57,7 +57,7 @@ def find_truth(problem: ReachAvoidProblem, count: int, seed: int, points: Mappin
     """The reference values at `count` random states.
 
     The grid is solved for problems with at most `LARGEST` states and controls. States at which it is in doubt are left
-    out. If too few of the drawn ones remain, the grid is no truth at all.
+    out. If too few of the drawn ones remain, or the target is too thin for the mesh, the grid is no truth at all.
 
     Args:
         problem: the physics.
@@ -74,7 +74,10 @@ def find_truth(problem: ReachAvoidProblem, count: int, seed: int, points: Mappin
         return Truth(tau[:count], x[:count], exact, "exact")
     if problem.states.dim not in points or problem.states.dim + problem.controls.dim > LARGEST:
         return Truth(tau[:count], x[:count], None, "none")
-    grid = GridSolver(problem, points[problem.states.dim]).solve()
+    solver = GridSolver(problem, points[problem.states.dim])
+    if not solver.resolves_target:
+        return Truth(tau[:count], x[:count], None, "none")
+    grid = solver.solve()
     error = grid.error(tau, x)
     kept = (error <= DOUBT).nonzero().flatten()[:count]
     if len(kept) < count:
