@@ -17,8 +17,8 @@ from pirl_rl.time_steps import check_time_steps, propose_time_steps
 AUTO = "auto"
 """The value that leaves a choice to the package.
 
-Keys that take it: env.dt, env.substeps, trainer.updates, collector.n_steps, stages[i].n_steps, actor.choices,
-actor.together, loss.hjb_probes and the entries of `PATHS`.
+Keys that take it: env.dt, env.substeps, trainer.updates, actor.choices, actor.together, loss.hjb_probes and the entries
+of `PATHS`.
 """
 
 UPDATES_PER_DIMENSION, FEW_STATES, UPDATES_OF_MANY = 2_300, 3, 2_900
@@ -32,9 +32,6 @@ BASE_COST, MOST_COST = 80, 1_700_000
 
 The number of updates that is chosen, times this sum, is at most MOST_COST.
 """
-
-RETURNS, LEAST_RETURNS = 40, 10
-"""Returns run over the control steps in the horizon divided by the first number, but over at least the second."""
 
 PATHS = {
     ("success", "episodes"): (10_000, 1_000),
@@ -87,19 +84,6 @@ def choose_updates(config: DictConfig, problem: ReachAvoidProblem) -> None:
             config.trainer.updates = min(UPDATES_PER_DIMENSION * (n + 1), MOST_OF_FEW)
         else:
             config.trainer.updates = min(UPDATES_OF_MANY * (n + 1), max(1, MOST_COST // (BASE_COST + n)))
-
-
-def choose_returns(config: DictConfig, problem: ReachAvoidProblem) -> None:
-    """Replace `auto` in the lengths of returns by numbers that follow from the control step, which is chosen before.
-
-    A stage has returns of twice the length of the run's: stages that set the length keep the policy as it is, so that
-    long returns are its own.
-    """
-    stages = [stage for stage in config.stages or () if isinstance(stage, DictConfig)]
-    for entry, times in ((config.collector, 1), *((stage, 2) for stage in stages)):
-        if entry.get("n_steps") == AUTO:
-            steps = problem.horizon / convert(config.env.dt, float, "env.dt")
-            entry.n_steps = times * max(LEAST_RETURNS, round(steps / RETURNS))
 
 
 def choose_choices(config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[str] = ()) -> None:
