@@ -123,7 +123,13 @@ def make_mesh(problem: ReachAvoidProblem, points: Sequence[int], margin: np.ndar
 def resolves_target(problem: ReachAvoidProblem, points: Sequence[int], margin: np.ndarray) -> bool:
     """Whether A has `LEAST_ACROSS` nodes in a row along each axis, on the mesh of `make_mesh` before it is cut.
 
-    A target that reaches the edge of that mesh counts as one that goes on beyond it.
+    A target that reaches the edge of that mesh counts as one that goes on beyond it. Without a target there is nothing
+    to resolve.
+
+    Args:
+        problem: the physics.
+        points: the numbers of nodes across `problem.states` along each axis.
+        margin: how far the mesh goes beyond `problem.states` on each side (n,), in SI units.
     """
     if problem.objective != "reach-avoid":
         return True

@@ -85,14 +85,14 @@ class GridSolver:
         Raises:
             ArgumentError: no node is outside A and B, or none is next to the target.
         """
+        if self.estimate and not self.resolves_target:
+            warnings.warn(
+                f"points: the target has fewer than {LEAST_ACROSS} nodes in a row along an axis with points="
+                f"{self.points}, so that the estimate of the error can be far too small; expected more points",
+                stacklevel=2,
+            )
         solution = self._solved(self.points)
         if self.estimate:
-            if not self.resolves_target:
-                warnings.warn(
-                    f"points: the target has fewer than {LEAST_ACROSS} nodes in a row along an axis with points="
-                    f"{self.points}, so that the estimate of the error can be far too small; expected more points",
-                    stacklevel=2,
-                )
             half = tuple(max((count + 1) // 2, 3) for count in self.points)
             # Both have the same scheme, or their distance would not be an estimate of the error.
             solution.coarse = self._solved(half, (max(solution.steps // 2, 1), solution.split))
