@@ -27,12 +27,9 @@ def noise_channels(problem: ReachAvoidProblem) -> int:
     return problem.diffusion(x, u).shape[-1]
 
 
-def has_controlled_noise(problem: ReachAvoidProblem, points: int = 256, seed: int = 0) -> bool:
-    """Whether sigma depends on u, judged by `points` sampled states, each with two sampled controls."""
-    rng = torch.Generator().manual_seed(seed)
-    x = problem.states.sample(points, rng)
-    one, other = (problem.diffusion(x, problem.controls.sample(points, rng)) for _ in range(2))
-    return not torch.equal(one, other)
+def has_controlled_noise(problem: ReachAvoidProblem) -> bool:
+    """Whether sigma depends on u, see `controlled_channels`."""
+    return any(controlled_channels(problem))
 
 
 def controlled_channels(problem: ReachAvoidProblem, points: int = 256, seed: int = 0) -> list[list[int]]:
@@ -43,14 +40,10 @@ def controlled_channels(problem: ReachAvoidProblem, points: int = 256, seed: int
         points: the number of random states, each with two controls that differ in the coordinate alone.
         seed: of the points.
     """
-    rng = torch.Generator().manual_seed(seed)
-    x = problem.states.sample(points, rng)
-    one, drawn = (problem.controls.sample(points, rng) for _ in range(2))
+    x, one, drawn, _ = _random_points(problem, points, seed)
     sigma, found = problem.diffusion(x, one), []
     for axis in range(problem.controls.dim):
-        other = one.clone()
-        other[:, axis] = drawn[:, axis]
-        changed = (problem.diffusion(x, other) != sigma).any(0).any(0)
+        changed = (problem.diffusion(x, _with_coordinate(one, axis, drawn)) != sigma).any(0).any(0)
         found.append(changed.nonzero().squeeze(-1).tolist())
     return found
 
@@ -63,10 +56,8 @@ def is_control_affine(problem: ReachAvoidProblem, points: int = 256, seed: int =
         points: the number of states, each with two controls and a random point on the line through them.
         seed: of the points.
     """
-    rng = torch.Generator().manual_seed(seed)
-    x = problem.states.sample(points, rng, torch.float64)
-    one, other = (problem.controls.sample(points, rng, torch.float64) for _ in range(2))
-    return _is_affine_between(problem, x, one, other, rng) and not has_controlled_noise(problem, points, seed)
+    x, one, other, rng = _random_points(problem, points, seed)
+    return _is_affine_between(problem, x, one, other, rng) and not has_controlled_noise(problem)
 
 
 def is_affine_in(problem: ReachAvoidProblem, axis: int, points: int = 256, seed: int = 0) -> bool:
@@ -80,13 +71,26 @@ def is_affine_in(problem: ReachAvoidProblem, axis: int, points: int = 256, seed:
         points: the number of states, each with two controls and a random point on the line through them.
         seed: of the points.
     """
+    x, one, drawn, rng = _random_points(problem, points, seed)
+    affine = _is_affine_between(problem, x, one, _with_coordinate(one, axis, drawn), rng)
+    return affine and not controlled_channels(problem)[axis]
+
+
+def _random_points(
+    problem: ReachAvoidProblem, points: int, seed: int
+) -> tuple[Tensor, Tensor, Tensor, torch.Generator]:
+    """States (N, n) with two controls (N, m) each, in double precision, and the generator that has drawn them."""
     rng = torch.Generator().manual_seed(seed)
-    x = problem.states.sample(points, rng, torch.float64)
-    one, drawn = (problem.controls.sample(points, rng, torch.float64) for _ in range(2))
-    other = one.clone()
-    other[:, axis] = drawn[:, axis]
-    still = torch.equal(problem.diffusion(x, one), problem.diffusion(x, other))
-    return still and _is_affine_between(problem, x, one, other, rng)
+    boxes = problem.states, problem.controls, problem.controls
+    x, one, other = (box.sample(points, rng, torch.float64) for box in boxes)
+    return x, one, other, rng
+
+
+def _with_coordinate(u: Tensor, axis: int, drawn: Tensor) -> Tensor:
+    """Controls (N, m) with one coordinate from other controls (N, m)."""
+    changed = u.clone()
+    changed[:, axis] = drawn[:, axis]
+    return changed
 
 
 def _is_affine_between(problem: ReachAvoidProblem, x: Tensor, one: Tensor, other: Tensor, rng: torch.Generator) -> bool:

@@ -12,15 +12,9 @@ from torch import Tensor
 
 from benchmarks.kinds import Bicycle, Gusty, Investor, Loiter, Sprint, TwoHarbours
 from pirl_rl import Box, ReachAvoidProblem
+from pirl_rl.action_values import continued_value, expected_ahead, hamiltonian, value_ahead
 from pirl_rl.actor_rules import BestControl, Hamiltonian
-from pirl_rl.ascent import (
-    ascend,
-    continued_value,
-    expected_ahead,
-    hamiltonian,
-    improved,
-    value_ahead,
-)
+from pirl_rl.ascent import ascend, improved
 from pirl_rl.assembly import make_trainer
 from pirl_rl.automatic import choose_choices
 from pirl_rl.commands.composition import compose
@@ -123,7 +117,7 @@ def test_the_cubature_is_exact_for_a_quadratic_value():
     mean, sigma = y + problem.drift(y, u) * h.unsqueeze(-1), problem.diffusion(y, u)
     trace = (sigma * (Quadratic.M @ sigma)).sum((-2, -1))
     expected = Quadratic(problem).value(tau - h, mean) + h * trace / 2
-    found = expected_ahead(Quadratic(problem), tau, x, 0.3)(action)  # type: ignore[arg-type]
+    found = expected_ahead(Quadratic(problem), tau, x, 0.3, range(sigma.shape[-1]))(action)  # type: ignore[arg-type]
     assert torch.allclose(found, expected, atol=1e-5)
 
 
@@ -211,7 +205,7 @@ class Straight:
 def test_noise_beside_a_face_is_not_preferred():
     """Without the continuation into B, a path that crosses its face could return, and noise would seem to help."""
     x = torch.tensor([[-0.999, 0.0], [-0.95, 0.3], [0.0, 0.0], [0.95, 0.3], [0.999, 0.0]])
-    objective = expected_ahead(Straight(), torch.ones(5), x, 0.05)  # type: ignore[arg-type]
+    objective = expected_ahead(Straight(), torch.ones(5), x, 0.05, [0, 1])  # type: ignore[arg-type]
     still, noisy = (objective(torch.full((5, 1), action)) for action in (-1.0, 1.0))
     assert torch.allclose(still, noisy, atol=1e-6)
 
@@ -226,7 +220,7 @@ def test_several_actions_at_once_have_the_values_of_each_of_them_beside_faces(cr
     level = torch.minimum(problem.avoid_level(x), problem.target_level(x)).abs()
     x = x[problem.interior(x)][level[problem.interior(x)] < 0.05]
     tau, actions = torch.full((len(x),), 0.5), 2 * torch.rand(3, 2, len(x), 2) - 1
-    objective = expected_ahead(solution, tau, x, 0.05)
+    objective = expected_ahead(solution, tau, x, 0.05, [0, 1])
     found, u, h = objective(actions), problem.controls.denormalize(actions), 0.05
     for i, j in itertools.product(range(3), range(2)):
         mean, sigma = x + h * problem.drift(x, u[i, j]), problem.diffusion(x, u[i, j])

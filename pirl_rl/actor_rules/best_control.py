@@ -9,8 +9,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from pirl_rl.action_values import Flow, expected_ahead, hamiltonian, value_ahead
 from pirl_rl.actor_rules.base import ActorRule
-from pirl_rl.ascent import Flow, Objective, expected_ahead, hamiltonian, improved, value_ahead
+from pirl_rl.ascent import Objective, improved
 from pirl_rl.errors import ArgumentError
 from pirl_rl.networks import Critic
 from pirl_rl.operators import masked_mean
@@ -56,10 +57,10 @@ class BestControl(ActorRule):
     together, j is the best of all combinations of their levels, and w_i the range of the Hamiltonian over these.
 
     For the coordinates of u on which sigma depends, E V after one control step takes the place of the Hamiltonian,
-    divided by dt, see `pirl_rl.ascent.expected_ahead`: next to faces the Hessian of a network may have the wrong sign.
-    The step has the noise of those channels that depend on the coordinate. Coordinates on which the same channels
-    depend take their best levels at once, one block of them after the other. With more noise channels times controls
-    than `MOST_PAIRS` the step would be too dear, and the Hamiltonian stays.
+    divided by dt, see `pirl_rl.action_values.expected_ahead`: next to faces the Hessian of a network may have the
+    wrong sign. The step has the noise of those channels that depend on the coordinate. Coordinates on which the same
+    channels depend take their best levels at once, one block of them after the other. With more noise channels times
+    controls than `MOST_PAIRS` the step would be too dear, and the Hamiltonian stays.
 
     The Hamiltonian is the limit of a control that is never held. Where a control step is long, as with fewer than a
     hundred of them in the horizon, V after `steps` noise-free control steps takes its place, divided by dt: the first

@@ -15,7 +15,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pirl_rl.ascent import ascend, hamiltonian, replaced
+from pirl_rl.action_values import hamiltonian
+from pirl_rl.ascent import ascend, replaced
 from pirl_rl.solution import Solution
 from pirl_rl.structure import has_controlled_noise
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pirl_rl.action_values import look_ahead_policy
 from pirl_rl.arguments import Policy
-from pirl_rl.ascent import look_ahead_policy
 from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.inputs import like, noise_rng, points_rng
 from pirl_rl.evaluation.judgement import Difference, Measures, describe, judge, verdict_of

@@ -12,8 +12,8 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
+from pirl_rl.action_values import look_ahead_policy
 from pirl_rl.arguments import checked_points, points_and_answer, seeded
-from pirl_rl.ascent import look_ahead_policy
 from pirl_rl.assembly import make_evaluation_simulator, make_simulator, make_starts
 from pirl_rl.certificates import Certificate, Deployed, LawOfStarts, OneStart, certify, make_certifiers
 from pirl_rl.errors import ArgumentError
@@ -79,7 +79,7 @@ class Run:
             x: states (*, n) in SI units.
             lookahead: a number of control steps of the training without noise, the first with a candidate control and
                 the others with the actor's. The candidate with the largest V at their end is taken, see
-                `pirl_rl.ascent`; with 0, the actor's control is.
+                `pirl_rl.action_values`; with 0, the actor's control is.
             levels: each coordinate of the control has this many candidates, evenly spaced over its range. None takes
                 as many as the physics needs, at least five, see `pirl_rl.switching.candidate_controls`.
         """

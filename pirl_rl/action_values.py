@@ -1,0 +1,162 @@
+"""What an action at a state is worth: the functions of the action that an actor or a policy maximises.
+
+The Hamiltonian of V is the part of L^u V, Eq. (parabolic_operator), that depends on the control:
+
+    H(u) = f(x, u) . grad V,   plus 1/2 Tr(sigma sigma^T hess V) where sigma depends on u.
+
+V is differentiated once for a state, and each control that is tried costs one evaluation of the physics. The other two
+functions are the expectation of V after one step with noise, and V some steps ahead without noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from pirl_rl.arguments import Policy
+from pirl_rl.ascent import Objective, ascend
+from pirl_rl.simulator import Simulator
+from pirl_rl.solution import Solution
+
+Flow = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""Maps states (N, n), controls (N, m) and lengths (N,), in s, to the states (N, n) after a step without noise."""
+
+
+def hamiltonian(solution: Solution, tau: Tensor, x: Tensor, controlled_noise: bool) -> Objective:
+    """H (*, N), in 1/s, as a function of normalised actions (*, N, m).
+
+    Args:
+        solution: gives V, whose action is frozen at the policy's, and the problem.
+        tau: times to go (N,), in s.
+        x: states (N, n).
+        controlled_noise: whether sigma depends on u, see `pirl_rl.structure.has_controlled_noise`.
+    """
+    problem, slope = solution.problem, solution.gradient(tau, x)
+    curvature = solution.hessian(tau, x) if controlled_noise else None
+
+    def value(action: Tensor) -> Tensor:
+        u = problem.controls.denormalize(action)
+        y = x.expand(*u.shape[:-1], x.shape[-1])
+        along = (problem.drift(y, u) * slope).sum(-1)
+        if curvature is None:
+            return along
+        sigma = problem.diffusion(y, u)
+        return along + (sigma * (curvature @ sigma)).sum((-2, -1)) / 2
+
+    return value
+
+
+def expected_ahead(solution: Solution, tau: Tensor, x: Tensor, length: float, channels: Sequence[int]) -> Objective:
+    """E V (*, N) after one Euler step with the action (*, N, m), by a cubature of degree three, Eq. (cubature).
+
+    The mean over y = x + f h +- sqrt(w h) sigma_k, for w columns of sigma, has the mean and the covariance of the step.
+    It is bounded where a second derivative is not: next to a face V may change within one step, and there the learned
+    curvature may be of any size and sign. V is continued into A and B, see `continued_value`.
+
+    Args:
+        solution: gives V, with its values in A and B, and the problem.
+        tau: times to go (N,), in s.
+        x: states (N, n).
+        length: h in s; it is shortened to tau.
+        channels: the w columns of sigma that count, at least one. The effect of a column that does not depend on the
+            action adds the same to all actions, to first order in h, and may be left out.
+    """
+    problem, h = solution.problem, tau.clamp(max=length)
+
+    def value(action: Tensor) -> Tensor:
+        u, shape = problem.controls.denormalize(action), action.shape[:-1]
+        y = x.expand(*shape, -1)
+        columns = problem.diffusion(y, u).movedim(-1, 0)
+        sigma = torch.stack([columns[k] for k in channels])
+        spread = sigma * (len(sigma) * h).sqrt().unsqueeze(-1)
+        ends = y + problem.drift(y, u) * h.unsqueeze(-1) + torch.cat([spread, -spread])
+        return continued_value(solution, (tau - h).expand(ends.shape[:-1]), ends).mean(0)
+
+    return value
+
+
+def continued_value(solution: Solution, tau: Tensor, x: Tensor) -> Tensor:
+    """V (*), continued into A and B as an odd function about its value at the face, Eq. (continuation).
+
+    By the reflection principle, the mean of this over the ends of paths without drift that start beside a plane face
+    is the mean of V over the paths that stop at the face. Without the continuation the mean would count paths that
+    cross a face and return within the step as if they had not crossed it, and so favour noise beside B.
+
+    Args:
+        solution: gives V, and the problem.
+        tau: times to go (*), in s.
+        x: states (*, n).
+    """
+    problem = solution.problem
+    failed, reached = problem.failed(x), problem.reached(x)
+    y = x
+    if problem.has_avoid_set:
+        y = torch.where(failed.unsqueeze(-1), _mirrored(problem.avoid_level, x), y)
+    if problem.objective == "reach-avoid":
+        y = torch.where(reached.unsqueeze(-1), _mirrored(lambda z: problem.reached_constraints(z).amax(-1), x), y)
+    # Networks take one axis of points: stacked critics have an axis of their own before it.
+    value = solution.value(tau.flatten(), y.flatten(0, -2)).reshape(tau.shape)
+    return torch.where(reached, 2 - value, torch.where(failed, -value, value))
+
+
+def _mirrored(level: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
+    """The states (*, n), mirrored at the zero of a level, to first order in the level."""
+    slope = torch.func.grad(lambda y: level(y).sum())(x)
+    return x - 2 * level(x).unsqueeze(-1) * slope / slope.square().sum(-1, keepdim=True).clamp(min=1e-12)
+
+
+def value_ahead(
+    solution: Solution, simulator: Simulator, tau: Tensor, x: Tensor, steps: int, flow: Flow | None = None
+) -> Objective:
+    """V after a few control steps without noise, the first of them with the action (*, N, m), the others with pi.
+
+    A path stops at the end of the step in which it enters A or B, and at tau = 0. Where sigma depends on the control,
+    the expectation of the noise's effect is added to first order: 1/2 Tr(sigma sigma^T hess V) at x times the length
+    of the first step.
+
+    Args:
+        solution: gives V, pi and the problem.
+        simulator: simulates the control steps.
+        tau: times to go (N,), in s.
+        x: states (N, n).
+        steps: the number of control steps, at least 1.
+        flow: replaces `simulator.flow`, compiled for example.
+    """
+    problem, clock, flow = solution.problem, simulator.clock, flow or simulator.flow
+    curvature = solution.hessian(tau, x) if simulator.controlled_noise else None
+
+    def value(action: Tensor) -> Tensor:
+        u, shape = problem.controls.denormalize(action), action.shape[:-1]
+        t, y = tau.expand(shape).flatten(), x.expand(*shape, -1).flatten(0, -2)
+        for index in range(steps):
+            left, shortfall = clock.split(t)
+            live, h = problem.interior(y) & (left > 0), clock.length(left, shortfall).to(y)
+            y = torch.where(live.unsqueeze(-1), flow(y, solution.policy(t, y) if index else u.flatten(0, -2), h), y)
+            t = torch.where(live, t - h, t).clamp(min=0)
+        ahead = solution.value(t, y).reshape(shape)
+        if curvature is None:
+            return ahead
+        sigma, length = problem.diffusion(x.expand(*shape, -1), u), tau.clamp(max=simulator.dt)
+        return ahead + length * (sigma * (curvature @ sigma)).sum((-2, -1)) / 2
+
+    return value
+
+
+def look_ahead_policy(solution: Solution, simulator: Simulator, steps: int, levels: Tensor) -> Policy:
+    """The policy that takes the control with the largest V some control steps ahead, see `value_ahead`.
+
+    Args:
+        solution: gives V, and the policy at which the search starts and which it follows after the first step.
+        simulator: simulates the control steps.
+        steps: the number of control steps, at least 1.
+        levels: the candidates (K, s) for s coordinates of the control together, see `ascend`.
+    """
+    controls = solution.problem.controls
+
+    def policy(tau: Tensor, x: Tensor) -> Tensor:
+        start = controls.normalize(solution.policy(tau, x))
+        return controls.denormalize(ascend(value_ahead(solution, simulator, tau, x, steps), start, levels.to(x))[0])
+
+    return policy
