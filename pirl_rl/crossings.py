@@ -12,8 +12,7 @@ A = sqrt(1 - 4 b + 4 b g1 / g0) its first zero is at t = 2 / (1 + B), and it has
 zero, and the face is not crossed. Decisive is the nearest face where one is enough, and the farthest where all must be
 crossed, in units of the noise of their levels.
 
-Without the ends, the probability that a path crosses a face within a time is that of Brownian motion with drift, see
-`first_passage`.
+Without the ends, crossings within a time have the law of Brownian motion with drift, see `pirl_rl.passages`.
 
 A path enters an intersection of several sets, such as a box, at the time at which it crosses the last face, if no other
 level is positive then, see `enters_intersection`.
@@ -40,51 +39,6 @@ LEAST_BEND = -2.0
 
 SMALLEST = 1e-12
 """The smallest product of both levels of a bridge, in units of its variance, with which a time of crossing is drawn."""
-
-
-def first_passage(tau: Tensor, distance: Tensor, drift: Tensor | float = 1.0, sigma: Tensor | float = 1.0) -> Tensor:
-    """The probability (*) that drift * t + sigma W_t comes to a level at `distance` within tau.
-
-    It is Phi((m tau - d)/(s sqrt(tau))) + exp(2 m d/s^2) Phi(-(m tau + d)/(s sqrt(tau))) with the distance d, the drift
-    m and the strength s of the noise (Karatzas and Shreve, Brownian Motion and Stochastic Calculus, Sec. 3.5.C). The
-    factors of the second term may overflow or underflow. Their product is therefore computed with erfcx, except where
-    the drift leads so fast away from the level that exp(2 m d/s^2) is the small one.
-
-    Args:
-        tau: times (*), in s.
-        distance: distances (*) to the level; the level counts as reached where they are not positive.
-        drift: the drift (*) towards the level, in units of the distance per s.
-        sigma: the strength (*) of the noise, above 0, in units of the distance per sqrt(s).
-    """
-    outside = (distance > 0) & (tau > 0)
-    # Absorbed states and tau = 0 get other arguments, so that no NaN enters the gradient through torch.where.
-    d_safe = torch.where(outside, distance, torch.ones_like(distance))
-    tau_safe = torch.where(outside, tau, torch.ones_like(tau))
-    scale = torch.sqrt(2 * tau_safe) * sigma
-    early, late = (d_safe - drift * tau_safe) / scale, (d_safe + drift * tau_safe) / scale
-    towards = torch.exp(-(early**2)) * torch.special.erfcx(late.clamp(min=0))
-    away = torch.exp((2 * (drift / sigma) * (d_safe / sigma)).clamp(max=0)) * torch.special.erfc(late)
-    value = (torch.special.erfc(early) + torch.where(late > 0, towards, away)) / 2
-    return torch.where(outside, value, (distance <= 0).to(value.dtype))
-
-
-def passage_probability(constraints: Constraints, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor) -> Tensor:
-    """The probability (N, k) that paths cross each of k faces within the time h, wherever they are then.
-
-    Each level is taken as Brownian motion with drift, see `first_passage`.
-
-    Args:
-        constraints: the levels of the faces.
-        x: where the paths start (N, n). The probability is 1 for faces inside of which that is.
-        moved: where they are after h without noise (N, n).
-        sigma: (N, n, w) at x.
-        h: the time (N,), in s.
-    """
-    level, after = constraints(x), constraints(moved)
-    variance = squared_noise(constraints, x, sigma, level.shape[-1]) * h[..., None]
-    # In units of h, the drift is the way of the level, and the strength of the noise is its deviation after h.
-    deviation = variance.sqrt().clamp(min=torch.finfo(x.dtype).tiny ** 0.5)
-    return first_passage(torch.ones_like(level), level, level - after, deviation)
 
 
 def crossing_probability(

@@ -11,14 +11,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from pirl_rl.crossings import (
-    _crossing_time,
-    crosses_any,
-    crossing_probability,
-    enters_intersection,
-    first_passage,
-    passage_probability,
-)
+from pirl_rl.crossings import _crossing_time, crosses_any, crossing_probability, enters_intersection
+from pirl_rl.passages import first_passage
 
 DEVIATION = 0.7
 PATHS = 200_000
@@ -138,28 +132,6 @@ def test_any_face_is_enough_for_a_union():
     assert crosses_any(lambda y: y, x, moved, sigma, torch.ones(2), uniform).tolist() == [True, False]
 
 
-@pytest.mark.parametrize("drift", [-3.0, -0.5, 0.0, 0.5, 3.0])
-def test_first_passage_is_the_integral_of_its_density(drift):
-    """The density is d / (s sqrt(2 pi t^3)) exp(-(d - m t)^2 / (2 s^2 t)); the integral is over log t."""
-    d, s, tau = 0.7, 0.6, 1.5
-    log_t = torch.linspace(-12, math.log(tau), 40_001, dtype=torch.float64)
-    t = log_t.exp()
-    density = d / (s * (2 * math.pi * t**3).sqrt()) * (-((d - drift * t) ** 2) / (2 * s**2 * t)).exp()
-    expected = torch.trapezoid(density * t, log_t)
-    time, distance = (torch.tensor([number], dtype=torch.float64) for number in (tau, d))
-    assert first_passage(time, distance, drift, s).item() == pytest.approx(expected.item(), abs=1e-6)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_first_passage_is_a_probability_at_extreme_arguments(dtype):
-    scales = torch.tensor([0.0, 1e-30, 1e-3, 1.0, 1e6], dtype=dtype)
-    drifts = torch.cat([-scales, scales])
-    tau, d, m, s = torch.meshgrid(scales, scales, drifts, scales[1:], indexing="ij")
-    p = first_passage(tau, d, m, s)
-    assert ((p >= 0) & (p <= 1 + torch.finfo(dtype).eps)).all()
-    assert torch.equal(p[tau == 0], (d[tau == 0] <= 0).to(dtype))
-
-
 def test_bridges_with_random_ends_cross_with_the_probability_of_a_first_passage():
     """The mean over the normal distribution of the ends is taken at 20,001 equidistant quantiles."""
     a, v, s, h = 0.3, 0.4, 0.5, 2.0
@@ -218,14 +190,3 @@ def test_levels_without_a_tangent_give_probabilities(dtype):
     uniform, normal = torch.full((2, 3, 4), 0.5, dtype=dtype), torch.zeros(2, 2, 3, 4, dtype=dtype)
     inside = lambda y: torch.stack([y[:, 0] * 0, y[:, 0] - 9], -1)  # noqa: E731
     assert enters_intersection(inside, x, x + 0.1, sigma, time, uniform[..., :2], normal[..., :2]).all()
-
-
-def test_a_path_leaves_a_wall_with_its_exact_probability():
-    """With drift v away from a face at the distance a, 1 - exp(-2 a v / sigma^2) of the paths never cross it."""
-    a, v, s, h = torch.tensor([0.01, 0.1, 0.3], dtype=torch.float64), 1.0, 0.5, 50.0
-    x, moved = a[:, None], a[:, None] + v * h
-    sigma, time = torch.full((3, 1, 1), s, dtype=torch.float64), torch.full((3,), h, dtype=torch.float64)
-    crossed = passage_probability(lambda y: y, x, moved, sigma, time)
-    torch.testing.assert_close(crossed[:, 0], (-2 * a * v / s**2).exp(), rtol=0, atol=1e-6)
-    still = passage_probability(lambda y: y, x, x, sigma * 0, time)
-    assert (still == 0).all()

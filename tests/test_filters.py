@@ -12,13 +12,13 @@ from torch import Tensor
 
 from pirl_rl import ReachAvoidFilter
 from pirl_rl.certificates import lower_bound, upper_bound
-from pirl_rl.crossings import first_passage
 from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.monte_carlo import mean_payoff
 from pirl_rl.filters import MODES, nearest_action, values_ahead
 from pirl_rl.grid import GridSolver
 from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.operators import generator
+from pirl_rl.passages import first_passage
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems import DubinsCar, Exit1D, HalfSpace, Pendulum, PlanarQuadrotor, Reach1D, VehicleDrift
 from pirl_rl.simulator import Simulator

@@ -2,16 +2,17 @@
 
 A jump of the chain is as long as the distance h of two nodes. Where the noise sigma is so weak that h |f| > sigma^2 the
 scheme is upwind, and adds a noise of its own of the variance h |f| per unit of time. There each step of the length dt
-has two parts instead. First V moves along the flow,
+has three parts instead. In the first and in the last the noise acts for dt / 2, by the chain without drift. In between
+V moves along the flow,
 
     W(x) = max_u V(tau, x(dt; u)),   dx/dt = f(x, u),   x(0) = x,
 
 a semi-Lagrangian step (M. Falcone and R. Ferretti, Semi-Lagrangian Approximation Schemes for Linear and Hamilton-Jacobi
-Equations, SIAM, 2013), where a path that enters A or B on its way has their value. Then the noise acts for the time dt,
-by the chain without drift. Between nodes V is a cubic spline that is limited to the values at the corners of the cell
-(R. Bermejo and A. Staniforth, Monthly Weather Review 120, 1992), so that it stays in [0, 1].
+Equations, SIAM, 2013), where a path that enters A or B on its way has their value. Between nodes V is a
+cubic spline that is limited to the values at the corners of the cell (R. Bermejo and A. Staniforth, Monthly Weather
+Review 120, 1992), so that it stays in [0, 1].
 
-Where sigma depends on u, the control of a step must be the best one for both of its parts. A node that plays u has
+Where sigma depends on u, the control of a step must be the best one for drift and noise. A node that plays u has
 
     V(x) - dt L_u V(x) = W_u(x),   W_u(x) = V(tau, x(dt; u)),
 
@@ -19,8 +20,8 @@ with the generator L_u of the noise alone, and the best u follows by policy iter
 
 At tau = 0 V jumps at the faces, and in the short time sigma^2 / |f|^2 the noise makes layers there that are thinner
 than a cell. A path that the flow leads to a face has crossed it earlier, on average, than at its end alone, and V keeps
-this lead for good. So in the first steps V is the probability of crossing the faces while a control is held, see
-`pirl_rl.crossings.passage_probability`.
+this lead for good. So in the first steps V is the probability of entering A, or of not entering B for invariance, while
+a control is held, see `pirl_rl.passages.entrance_probability`.
 """
 
 from __future__ import annotations
@@ -29,8 +30,9 @@ import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, minimum_filter, spline_filter
 
-from pirl_rl.crossings import passage_probability, squared_noise
+from pirl_rl.crossings import squared_noise
 from pirl_rl.grid.mesh import Mesh, absorbed
+from pirl_rl.passages import entrance_probability, passage_probability
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.structure import has_controlled_noise
 
@@ -56,7 +58,7 @@ def is_weak(problem: ReachAvoidProblem, mesh: Mesh, x: np.ndarray, controls: np.
     Where the noise depends on the control, its largest variance is compared with the largest drift.
     """
     points, variance, drift = torch.from_numpy(x), np.zeros_like(x), np.zeros_like(x)
-    for u in controls if has_controlled_noise(problem) else controls[:1]:
+    for u in controls:
         control = torch.from_numpy(np.ascontiguousarray(u))
         sigma = problem.diffusion(points, control).numpy() / mesh.spacing[:, None]
         variance = np.maximum(variance, (sigma**2).sum(-1))
@@ -205,11 +207,11 @@ def _passed(
     Paths that the flow leads into a set and out of it again have its value.
     """
     moved = problem.states.wrap(moved)
-    h, sigma, alive = torch.full_like(x[:, 0], dt), problem.diffusion(x, u), torch.ones_like(x[:, 0])
-    if problem.has_avoid_set:
-        alive = (1 - passage_probability(problem.avoid_constraints, x, moved, sigma, h)).prod(-1)
+    path = x, moved, problem.diffusion(x, u), torch.full_like(x[:, 0], dt)
+    avoid = problem.avoid_constraints if problem.has_avoid_set else None
     if problem.objective == "reach-avoid":
-        # Every constraint of A must hold; the noise of different faces is taken as independent.
-        alive = alive * passage_probability(problem.target_constraints, x, moved, sigma, h).prod(-1)
+        succeeded = entrance_probability(problem.target_constraints, avoid, *path)
+    else:
+        succeeded = (1 - passage_probability(problem.avoid_constraints, *path)).prod(-1)
     inside = torch.where(torch.from_numpy(end > 0), problem.reached(moved), problem.failed(moved))
-    return np.where(ended & ~inside.numpy(), end, alive.numpy())
+    return np.where(ended & ~inside.numpy(), end, succeeded.numpy())

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pirl_rl.crossings import first_passage
+from pirl_rl.passages import first_passage
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sets import Box
 

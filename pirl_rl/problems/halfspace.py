@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from pirl_rl.constants import constant
-from pirl_rl.crossings import first_passage
 from pirl_rl.errors import ArgumentError
+from pirl_rl.passages import first_passage
 from pirl_rl.payoffs import Payoff
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sets import Box, Plane
