@@ -11,7 +11,7 @@ from oracles import PROBLEMS, name
 
 from pirl_rl.errors import ProblemError
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.problems import Reach1D, Safety1D, VehicleDrift
+from pirl_rl.problems import RadialExit, Reach1D, Safety1D, VehicleDrift
 from pirl_rl.problems.drift.starts import EquilibriumStates
 from pirl_rl.sampling.faces import NearFaces
 from pirl_rl.sampling.initial_states import UniformStates, VisitedStates, sample_interior
@@ -232,6 +232,8 @@ def test_edges_that_move_out_are_announced(capsys):
     WiderStates(UniformStates(), Simulator(Stream(2.0), 0.05))
     assert "starts: Paths leave the box of states" in (text := capsys.readouterr().err)
     assert "from 0 to 1.5 along axis 0." in text
+    WiderStates(UniformStates(), Simulator(RadialExit(dim=9), 0.05))
+    assert "along axis 5, and along 3 other axes." in capsys.readouterr().err
 
 
 def test_a_share_of_zero_plays_no_paths(monkeypatch):

@@ -5,9 +5,9 @@ from benchmarks.kinds.compartments import Anaesthesia, LotkaVolterra, Rooms
 from benchmarks.kinds.cycles import JetLag, PowerSwing, Runaway, Searchlight
 from benchmarks.kinds.masses import Crosswind, Gusty, Lander, Orbit, Servo, Sprint, VanDerPol
 from benchmarks.kinds.mixtures import Bearing, Mirror, Mixture
-from benchmarks.kinds.passages import SlotChange, TwoLink
-from benchmarks.kinds.plants import Epidemic, Investor, Reservoir, Toggle, Tokens, TwoTanks
-from benchmarks.kinds.stores import FastCharge, Ferment, Forager
+from benchmarks.kinds.passages import FastRiver, Glider, SlotChange, TwoLink
+from benchmarks.kinds.plants import Epidemic, Investor, Reactor, Reservoir, Toggle, Tokens, TwoTanks
+from benchmarks.kinds.stores import FastCharge, Ferment, Fishery, Forager
 from benchmarks.kinds.swings import Duffing, MountainCar, Swingup
 from benchmarks.kinds.vehicles import Bicycle, Evader, Loiter, Ring, River, Slalom, Steering, TwoCars, TwoHarbours
 from pirl_rl import ReachAvoidProblem
@@ -18,6 +18,6 @@ KINDS: tuple[type[ReachAvoidProblem], ...] = (Servo, Steering, Evader, Gusty, Tw
 KINDS += (VanDerPol, TwoHarbours, River, Loiter, Crosswind, Bicycle, Tokens, Lander, Epidemic, Toggle, TwoCars, Sprint)
 KINDS += (Investor, Runaway, JetLag, Searchlight, PowerSwing, Forager, Ferment, FastCharge, SlotChange, TwoLink)
 KINDS += (Bearing, Mirror, Duffing, MountainCar, Swingup, Pursuit, Rooms, Anaesthesia)
-KINDS += (LotkaVolterra, Chain, Unicycle, Rendezvous)
+KINDS += (LotkaVolterra, Chain, Unicycle, Rendezvous, FastRiver, Glider, Reactor, Fishery)
 
 PROBLEMS = {kind.__name__: kind for kind in KINDS}

@@ -1,4 +1,4 @@
-"""A satellite and an arm, which pass obstacles on either side."""
+"""A satellite, an arm, a boat and a glider: obstacles are passed on either side, or against time."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import math
 import torch
 from torch import Tensor
 
-from benchmarks.kinds.shapes import rows
+from benchmarks.kinds.shapes import constant, rows
 from pirl_rl import Box, ReachAvoidProblem
+from pirl_rl.problems import ZermeloBoat
 
 
 class SlotChange(ReachAvoidProblem):
@@ -86,3 +87,37 @@ class TwoLink(ReachAvoidProblem):
                 nearest = start + share.clamp(0, 1).unsqueeze(-1) * along
                 gaps.append((post - nearest).square().sum(-1).clamp(min=1e-12).sqrt() - r)
         return torch.stack(gaps, -1).amin(-1)
+
+
+class FastRiver(ZermeloBoat):
+    """Zermelo's boat with other constants: a current one and a half times as fast as the boat, and weaker noise."""
+
+    horizon, current, noise = 5.0, 1.5, (0.15, 0.2)
+    controls = Box([-1.0, -0.6], [1.0, 0.6])
+    landing, landing_radius = (0.6, -0.55), 0.2
+    rock, rock_radius = (-0.5, -0.3), 0.3
+
+
+class Glider(ReachAvoidProblem):
+    """Come to an airfield at a height of at least 0.2 km before dusk; the faster the flight, the faster it sinks.
+
+    The states are the distance flown in km and the height in km; the control is the speed in km/h. Thermals lift the
+    glider at two places. At most states the time to go allows for little more than the flight at full speed.
+    """
+
+    horizon = 0.6  # h
+    states, controls = Box([0.0, 0.0], [50.0, 2.0]), Box([80.0], [200.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        distance, speed = x[..., 0], u[..., 0]
+        lift = 6 * torch.exp(-(((distance - 20) / 3) ** 2)) + 4 * torch.exp(-(((distance - 38) / 2) ** 2))
+        return rows(speed, lift - 2.0 - 0.0004 * (speed - 85).square())
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return constant(x, [4.0, 0.0], [0.0, 0.5])
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return rows(50 - x[..., 0], 0.2 - x[..., 1])
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        return x[..., 1:]

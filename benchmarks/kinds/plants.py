@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from benchmarks.kinds.shapes import rows
+from benchmarks.kinds.shapes import constant, rows
 from pirl_rl import Box, ReachAvoidProblem
 
 
@@ -123,3 +123,24 @@ class Investor(ReachAvoidProblem):
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
         return x - 0.5
+
+
+class Reactor(ReachAvoidProblem):
+    """Bring a stirred reactor to its middle, unstable state without a runaway; conversion and temperature, scaled."""
+
+    horizon = 6.0
+    states, controls = Box([0.0, 0.0], [1.0, 6.0]), Box([-2.0], [2.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        conversion, heat = x.unbind(-1)
+        rate = 0.072 * (1 - conversion) * torch.exp(heat / (1 + heat / 20))
+        return rows(-conversion + rate, -1.3 * heat + 8 * rate + 0.6 * u[..., 0])
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return constant(x, [0.05, 0.0], [0.0, 0.35])
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return rows((x[..., 0] - 0.447).abs() - 0.06, (x[..., 1] - 2.75).abs() - 0.35)
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        return 5 - x[..., 1:]

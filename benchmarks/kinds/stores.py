@@ -1,4 +1,4 @@
-"""A bird, yeast and a battery: something is stored against time, and the noise depends on the control."""
+"""A bird, yeast, a battery and a stock of fish: something is stored against time."""
 
 from __future__ import annotations
 
@@ -73,3 +73,27 @@ class FastCharge(ReachAvoidProblem):
 
     def avoid_level(self, x: Tensor) -> Tensor:
         return 320 - 8 * x[..., 0].square() - x[..., 1]
+
+
+class Fishery(ReachAvoidProblem):
+    """Let a stock of fish recover that dies out where it is small, before the fleet that fishes less has no money left.
+
+    The states are the stock, as a share of what the sea can feed, and the money; the control is the effort.
+    """
+
+    horizon = 8.0
+    states, controls = Box([0.0, 0.0], [1.2, 1.0]), Box([0.0], [0.6])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        stock, effort = x[..., 0], u[..., 0]
+        growth = 0.48 * stock * (1 - stock) * (stock / 0.2 - 1)
+        return rows(growth - effort * stock, 0.5 * effort * stock - 0.06)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.diag_embed(rows(0.2 * x[..., 0], 0.05 * torch.ones_like(x[..., 0])))
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return rows(0.8 - x[..., 0], 0.3 - x[..., 1])
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        return rows(x[..., 0] - 0.1, x[..., 1])

@@ -27,6 +27,9 @@ LOOKS = 50
 TAIL = 0.02
 """The share of the noted states that may lie beyond the wider box on one side of an axis."""
 
+NAMED = 6
+"""The largest number of axes whose wider edges are printed."""
+
 FARTHEST = 2.0
 """The largest coordinate of an edge of the wider box, in coordinates in which `states` is [-1, 1]^n."""
 
@@ -61,8 +64,11 @@ class WiderStates:
         moved = [axis for axis in range(states.dim) if edges[axis] != wider[axis]]
         self.box = box if moved else None
         if moved:
-            reach = ", ".join("from {:.3g} to {:.3g} along axis {}".format(*wider[axis], axis) for axis in moved)
-            announce(f"starts: Paths leave the box of states. Some episodes start in a wider box, {reach}.")
+            named = ["from {:.3g} to {:.3g} along axis {}".format(*wider[axis], axis) for axis in moved[:NAMED]]
+            rest = f", and along {len(moved) - NAMED} other axes" if len(moved) > NAMED else ""
+            announce(
+                f"starts: Paths leave the box of states. Some episodes start in a wider box, {', '.join(named)}{rest}."
+            )
 
     def sample(
         self,
