@@ -398,8 +398,8 @@ def test_weak_noise_in_fewer_dimensions_has_its_closed_form(problem, count, tole
 class Landfall(ReachAvoidProblem):
     """Come to x_1 = 1 at a height of at least 0.2 while sinking at the speed 1, so that the largest speed, 2, is best.
 
-    A path comes to x_1 = 1 at a time t with the density f of `first_passage`. It has succeeded if the height is enough
-    then, or at last later, which by the height y above 0.2 has the chance exp(2 y / s^2) for y < 0.
+    A path comes to x_1 = 1 at a time t with the density of `first_passage`. It succeeds if it is high enough then or at
+    a later time. From a height that lacks y, the chance of that is exp(-2 y / s^2), with the strength s of its noise.
     """
 
     horizon, sigma, fall = 1.0, 0.2, 0.1

@@ -55,7 +55,7 @@ BLUR = 1.0
 def is_weak(problem: ReachAvoidProblem, mesh: Mesh, x: np.ndarray, controls: np.ndarray) -> bool:
     """Whether the noise is weak beside the mesh at most of the nodes x (M, n), with controls (K, M, m).
 
-    Where the noise depends on the control, its largest variance is compared with the largest drift.
+    The largest drift of all controls is compared with the largest variance of the noise.
     """
     points, variance, drift = torch.from_numpy(x), np.zeros_like(x), np.zeros_like(x)
     for u in controls:
