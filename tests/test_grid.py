@@ -612,18 +612,20 @@ class Conveyor(ReachAvoidProblem):
         return torch.where(way <= tau, terms.sum(-1), 0.0)
 
 
-def test_noise_that_depends_on_the_control_acts_in_turns_with_the_drift():
-    """V jumps where the way is tau. If both act together it is smeared, and wrong by up to 0.34 at these states."""
+@pytest.mark.parametrize(("count", "mean", "largest"), [(61, 0.004, 0.03), (121, 0.001, 0.01)])
+def test_noise_that_depends_on_the_control_acts_in_turns_with_the_drift(count, mean, largest):
+    """V jumps where the way is tau. If both act together it is smeared, and with 61 nodes wrong by up to 0.34 at these
+    states. The policy is judged where V is below 1, since elsewhere slower controls are as good."""
     problem = Conveyor()
-    solution = GridSolver(problem, 61, estimate=False).solve()
+    solution = GridSolver(problem, count, estimate=False).solve()
     tau, x = points(problem)
     away = (1 - x[:, 0] - tau).abs() > 0.05
     exact = problem.exact_value(tau, x)
     error = (solution.value(tau, x) - exact).abs()[away]
-    assert error.mean() < 0.004
-    assert error.max() < 0.03
-    best = (solution.policy(tau, x)[:, 0] == 1) | (exact > 1 - 1e-4)
-    assert best[away & (1 - x[:, 0] < tau)].double().mean() > 0.95, "where V is 1 slower controls are as good"
+    assert error.mean() < mean
+    assert error.max() < largest
+    decides = away & (1 - x[:, 0] < tau) & (exact < 1 - 1e-4)
+    assert (solution.policy(tau, x)[decides, 0] == 1).double().mean() > 0.95
 
 
 @pytest.fixture(scope="module")
