@@ -61,10 +61,11 @@ class March:
     def in_turns(self, value: np.ndarray, transport: Transport, first: int) -> Iterator[Level]:
         """Steps in which drift and noise act in turns, from V (M,) at tau = 0.
 
-        The noise acts for half a step before the drift and for half a step after it, so that the error is of second
-        order where the control is the same (G. Strang, SIAM Journal on Numerical Analysis 5, 1968). The lengths of the
-        steps are equal, so that their paths are the same. V is noted at the times of all solutions. In the `first`
-        steps V is that of a control that is held, where the noise acts on the faces.
+        The noise acts for half a step before the drift and for half a step after it. Where the control stays the same,
+        the error of taking turns is then of second order in the length of a step (G. Strang, SIAM Journal on Numerical
+        Analysis 5, 1968); that of the implicit Euler steps of the noise is of first order. The lengths of the steps are
+        equal, so that their paths are the same. V is noted at the times of all solutions. In the `first` steps V is
+        that of a control that is held, where the noise acts on the faces.
         """
         noisy, dt, times = transport.noise_acts_on_faces(), self._horizon / self._steps, self._steps * self._shares
         after, policy = self._continued(value), np.zeros(len(value), int)
