@@ -44,6 +44,7 @@ from pirl_rl.compilation import compiled
 from pirl_rl.figures import save_figures
 from pirl_rl.layers import Dense
 from pirl_rl.losses import PIRLLoss
+from pirl_rl.machine import keep_freed_memory
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.problems import HalfSpace
 from pirl_rl.sampling.collocation import Collocation
@@ -319,6 +320,7 @@ def main() -> None:
     parser.add_argument("--figure", type=Path)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    keep_freed_memory()
     warnings.filterwarnings("ignore", message="No target network updater")
     if arguments.short:
         rows = measure([(CACHED, False)], 2 * arguments.rounds)

@@ -82,7 +82,7 @@ def test_grid_holds_values_where_it_says():
 def test_value_maps_share_limits_and_are_labelled():
     figure = draw_value(evaluate_on_grid(random_solution(Reach1D()), 21, 21))
     learned, exact, error = (axes for axes in figure.axes if axes.get_title())
-    assert [axes.get_title().split(",")[0] for axes in (learned, exact, error)] == ["Learned V", "Exact V", "|error|"]
+    assert [axes.get_title().split(",")[0] for axes in (learned, exact, error)] == ["V", "Exact V", "|error|"]
     assert learned.collections[0].get_clim() == exact.collections[0].get_clim() == (0, 1)
     assert all("(s)" in axes.get_xlabel() for axes in (learned, exact, error))
     assert len(draw_value(evaluate_on_grid(random_solution(Safety1D()), 21, 21)).axes) == 2

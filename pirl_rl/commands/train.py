@@ -44,6 +44,7 @@ from pirl_rl.commands.start import adopt_networks
 from pirl_rl.configuration import CONF, PACKAGE, load_config
 from pirl_rl.errors import INTERRUPTED, ConfigError
 from pirl_rl.lock import locked
+from pirl_rl.machine import keep_freed_memory
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.progress import announce, helped
 from pirl_rl.run_directory import RunDirectory
@@ -126,6 +127,7 @@ def train_new(
     Raises:
         PirlError: if the configuration cannot be built, or training diverges or is interrupted.
     """
+    keep_freed_memory()
     with new_directory(folder):
         trust, problem = prepare(config, overrides, trust, problem)
         if config.trainer.get("seeds") is not None:
@@ -178,6 +180,7 @@ def go_on(folder: Path, overrides: Sequence[str], trust: Sequence[str] = ()) -> 
     Raises:
         PirlError: if the run cannot be resumed, or training diverges or is interrupted.
     """
+    keep_freed_memory()
     config = load_config(folder)
     if config.trainer.get("seeds") is not None:
         RunDirectory(folder).refuse_links()

@@ -56,13 +56,13 @@ class Measures:
     """What a verdict rests on; probabilities are means over the same states and times to go.
 
     Attributes:
-        success: of the learned policy.
+        success: of the policy.
         low, high: the 95% interval of `success`.
         random: success of random controls.
         constant: success of the best constant control.
         constant_control: that control, in SI units.
-        over_constant: constant minus learned, with its error.
-        ahead: look-ahead minus learned; None where it was not played.
+        over_constant: constant minus the policy, with its error.
+        ahead: look-ahead minus the policy; None where it was not played.
         finer: success with shorter time steps minus that with those of the training.
         gap: the mean of |V - Monte Carlo|.
         gap_error: the standard error of `gap`.
@@ -125,15 +125,14 @@ def _failures(m: Measures):
         also = "nor does a random or a constant control" if others < NEVER else f"while another reaches {others:.3f}"
         yield Reason(
             "failed",
-            f"The learned policy never {event}, {also}.",
+            f"The policy never {event}, {also}.",
             "check the sets with python -m pirl_rl.check, and that the horizon suffices",
         )
     if m.over_constant.mean > 0 and m.over_constant.matters():
         control = _numbers(m.constant_control)
         yield Reason(
             "failed",
-            f"The constant control {control} succeeds more often than the learned policy, by "
-            f"{m.over_constant.mean:.3f}.",
+            f"The constant control {control} succeeds more often than the policy, by {m.over_constant.mean:.3f}.",
             "train longer (trainer.updates) and from another seed",
         )
     if m.value_spread < FLAT and m.success_spread > VARIED:
@@ -179,7 +178,7 @@ def describe(m: Measures, reasons: list[Reason]) -> list[str]:
     if len(reasons) > 1:
         lines.append(f"          {' '.join(reason.why for reason in reasons[1:])}")
     ahead = "" if m.ahead is None else f", one step of look-ahead {m.success + m.ahead.mean:.3f}"
-    lines.append(f"success   {m.success:.3f} of the learned policy, 95% interval {m.low:.3f} to {m.high:.3f}")
+    lines.append(f"success   {m.success:.3f} of the policy, 95% interval {m.low:.3f} to {m.high:.3f}")
     lines.append(
         f"beside    random controls {m.random:.3f}, the best constant one, {_numbers(m.constant_control)}, "
         f"{m.constant:.3f}{ahead}"

@@ -72,7 +72,7 @@ class VerdictEvidence:
 
 
 class Verdict:
-    """Plays the learned policy beside others that need no training, at the same states, and judges the solution.
+    """Plays the policy beside others that need no training, at the same states, and judges the solution.
 
     Times to go are uniform in (0, T]. Points and noise are the same at every call.
 
@@ -98,7 +98,7 @@ class Verdict:
     def meanings(self, problem: ReachAvoidProblem) -> dict[str, str]:
         where = f"from {self.points:,} states and random times to go, {self.rollouts:,} paths each"
         return {
-            "success_learned": f"The success of the learned policy {where}.",
+            "success_learned": f"The success of the policy {where}.",
             "success_random": "The success of controls that are drawn at random in each control step, from there.",
             "success_constant": "The success of the best constant control out of the vertices and the centre of the "
             "box of controls, from there.",

@@ -54,12 +54,12 @@ def evaluate_on_grid(solution: Solution, taus: int = 101, states: int = 201) -> 
 
 
 def draw_surface(grid: Grid) -> Figure:
-    """A surface of the learned V over (tau, x)."""
+    """A surface of V over (tau, x)."""
     figure = Figure(figsize=(5.6, 4.8), layout="constrained")
     axes = figure.add_subplot(projection="3d")
     taus, states = np.meshgrid(grid.tau, grid.x)
     axes.plot_surface(taus, states, grid.value, cmap="viridis", vmin=0, vmax=1, rcount=60, ccount=60)  # type: ignore[attr-defined]
-    axes.set(title="Learned value V(τ, x)", xlabel="time to go τ (s)", ylabel="state x (SI)")
+    axes.set(title="Value V(τ, x)", xlabel="time to go τ (s)", ylabel="state x (SI)")
     axes.set(zlabel="V", zlim=(0, 1))
     axes.view_init(elev=28, azim=-130)  # type: ignore[attr-defined]
     axes.set_box_aspect((4, 4, 3), zoom=0.95)  # type: ignore[arg-type]
@@ -68,9 +68,9 @@ def draw_surface(grid: Grid) -> Figure:
 
 
 def draw_value(grid: Grid) -> Figure:
-    """Heat maps of the learned V and, if the exact V is known, of the exact V and the error."""
+    """Heat maps of V and, if the exact V is known, of the exact V and the error."""
     unit = Normalize(0, 1)
-    maps: list[tuple[str, np.ndarray, Normalize, str]] = [("Learned V", grid.value, unit, "viridis")]
+    maps: list[tuple[str, np.ndarray, Normalize, str]] = [("V", grid.value, unit, "viridis")]
     if grid.exact is not None:
         error = np.abs(grid.value - grid.exact)
         mse = np.square(error).mean()
@@ -89,7 +89,7 @@ def draw_policy(grid: Grid, solution: Solution) -> Figure:
     controls = solution.problem.controls
     figure = Figure(figsize=(0.6 + 4.2 * controls.dim, 3.8), layout="constrained")
     for i, axes in enumerate(figure.subplots(1, controls.dim, squeeze=False)[0]):
-        name = "Learned control u (SI)" if controls.dim == 1 else f"Learned control u{i + 1} (SI)"
+        name = "Control u (SI)" if controls.dim == 1 else f"Control u{i + 1} (SI)"
         _heat_map(figure, axes, grid, grid.control[i], Normalize(controls.low[i], controls.high[i]), "coolwarm", name)
     return figure
 

@@ -34,7 +34,7 @@ def draw_reliability(axes: Axes, value: np.ndarray, simulated: Mapping[str, np.n
         height = [mean[rows].mean() for rows in bins]
         error = [mean[rows].std() / len(rows) ** 0.5 for rows in bins]
         axes.errorbar(middle, height, error, fmt="o-", color=f"C{k}", capsize=2, label=label)
-    axes.set(xlabel="learned V, mean of a bin", ylabel="Monte Carlo, mean and standard error")
+    axes.set(xlabel="V, mean of a bin", ylabel="Monte Carlo, mean and standard error")
     axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
     axes.legend(fontsize="small", loc="upper left")
 
@@ -51,6 +51,6 @@ def draw_calibration(evidence: CalibrationEvidence) -> dict[str, Figure]:
     spread = np.sqrt(mean * (1 - mean) / comparison.rollouts)
     right.plot([0, 1], [0, 1], color="0.5", lw=1)
     right.errorbar(value, mean, spread, fmt=".", ms=4, lw=0.6, color="C0", ecolor="0.6")
-    right.set(title=f"mean |V - Monte Carlo| {comparison.mae():.4f}", xlabel="learned V", ylabel="Monte Carlo")
+    right.set(title=f"mean |V - Monte Carlo| {comparison.mae():.4f}", xlabel="V", ylabel="Monte Carlo")
     right.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
     return {"calibration": figure}

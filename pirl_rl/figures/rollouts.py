@@ -47,7 +47,7 @@ def draw_rollouts(evidence: RolloutsEvidence) -> dict[str, Figure]:
     if paths.state.shape[-1] > 2:
         note = "Coordinates that a plane does not show change along a path; V is that on the plane."
         figure.suptitle(note, fontsize="small")
-    figure.colorbar(mesh, ax=list(all_axes), label=f"learned V, τ = {sections[0].time:g} s")
+    figure.colorbar(mesh, ax=list(all_axes), label=f"V, τ = {sections[0].time:g} s")
     starts = zip(STARTS, values, strict=True)
     handles: list[Artist] = [
         Line2D([], [], color=c, marker="D", mec="black", label=f"from V = {value:.2f}") for c, value in starts

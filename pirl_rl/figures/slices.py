@@ -28,12 +28,12 @@ def draw_slices(evidence: SlicesEvidence) -> dict[str, Figure]:
 
 
 def draw_slice(cut: Slice) -> Figure:
-    """The learned V with the directions of the closed loop, beside Monte Carlo with the contours of V."""
+    """V with the directions of the closed loop, beside Monte Carlo with the contours of V."""
     section = cut.section
     gap = f"mean |difference| {cut.mae:.3f}"
     if cut.rollouts > 1:
         gap += f", of which noise {expected_deviation(section.value, cut.rollouts):.3f}"
-    titles = (f"Learned V, τ = {section.time:g} s", f"Monte Carlo of the policy, with lines of V;\n{gap}")
+    titles = (f"V, τ = {section.time:g} s", f"Monte Carlo of the policy, with lines of V;\n{gap}")
     figure = Figure(figsize=(10.4, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     for axes, title, values in zip((left, right), titles, (section.value, cut.monte_carlo), strict=True):
@@ -56,7 +56,7 @@ def draw_policy_slice(cut: Slice) -> Figure:
         mesh = axes.pcolormesh(first, second, action, cmap="coolwarm", vmin=-1, vmax=1, shading="nearest")
         draw_sets(axes, section)
         name = "u" if cut.action.shape[-1] == 1 else f"u_{{{i + 1}}}"
-        axes.set(title=f"Learned control ${name}$, τ = {section.time:g} s")
+        axes.set(title=f"Control ${name}$, τ = {section.time:g} s")
         axes.set(xlabel=section.plane.axes[0], ylabel=section.plane.axes[1])
     figure.colorbar(mesh, ax=list(panels), label="control, from its lower to its upper bound")
     return figure
