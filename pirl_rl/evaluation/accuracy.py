@@ -95,7 +95,7 @@ class Accuracy:
     def _meanings_under(self, name: str, simulator: Simulator) -> dict[str, str]:
         meanings = {
             "mse": f"The mean square of V minus Monte Carlo, the mean payoff of {self.rollouts:,} rollouts of the "
-            f"learned policy from each reference state, with control steps of {simulator.dt:g} s, integration steps of "
+            f"policy from each reference state, with control steps of {simulator.dt:g} s, integration steps of "
             f"{simulator.dt / simulator.substeps:g} s and the exit rule {simulator.crossing}; V is 1 in A and 0 in B.",
             "mae": f"The mean absolute value of the difference in {name}_mse.",
             "noise": f"The {name}_mse that a perfect V would have: the variance of the Monte Carlo means.",

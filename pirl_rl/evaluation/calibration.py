@@ -58,7 +58,7 @@ class Calibration:
         law = type(self.initial_states).__name__
         return {
             "calibration_mse": f"The mean square of V minus Monte Carlo, the mean payoff of {self.rollouts:,} rollouts "
-            f"of the learned policy, at {self.points:,} states drawn by {law} and random times to go; V is 1 in A and "
+            f"of the policy, at {self.points:,} states drawn by {law} and random times to go; V is 1 in A and "
             "0 in B.",
             "calibration_mae": "The mean absolute value of the difference in calibration_mse.",
             "calibration_noise": "The calibration_mse that a perfect V would have: the variance of the Monte Carlo "

@@ -65,7 +65,7 @@ class Residuals:
         where = f"{points} Sobol points outside A and B" if self.states is None else "the reference states"
         return {
             "hjb_loss": f"The mean of (L^pi V)^2 in 1/s^2, at {where}, for the V of the networks alone under the "
-            "learned policy.",
+            "policy.",
             "hjb_sup_loss": "The mean of (max_u L^u V)^2 in 1/s^2, at the same points: the HJB equation itself.",
             "boundary_loss": f"The mean of (V - l_eps)^2 at {points} points, half at tau = 0, half on the faces of A "
             "and B, for the V of the networks alone.",

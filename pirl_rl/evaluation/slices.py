@@ -156,7 +156,7 @@ class Slices:
             )
             meanings[f"slice_{name}_mae"] = (
                 f"The mean of |V - Monte Carlo|, the latter the mean payoff of {self.rollouts:,} rollouts of the "
-                f"learned policy, on the {self.points} x {self.points} grid of the plane {name}, edges included, at "
+                f"policy, on the {self.points} x {self.points} grid of the plane {name}, edges included, at "
                 f"tau = slice_{name}_tau; V is 1 in A and 0 in B."
             )
             meanings[f"slice_{name}_success"] = f"The mean of the Monte Carlo in slice_{name}_mae."

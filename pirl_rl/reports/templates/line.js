@@ -14,7 +14,7 @@ async function exploreLine(root) {
   const columns = (codes, turn) => x.map((_, i) => line.taus.map((_, t) => turn(codes[t * count + i])));
   const unit = () => (control().unit ? ` (${control().unit})` : "");
 
-  const NAMES = { value: "learned V", exact: "exact V", lower: "proved of the policy, from below", upper: "proved of all policies, from above" };
+  const NAMES = { value: "V", exact: "exact V", lower: "proved of the policy, from below", upper: "proved of all policies, from above" };
   const DASHES = { value: "solid", exact: "dash", lower: "dot", upper: "dot" };
   const curve = (codes, turn, name, dash, colour) => ({
     type: "scatter", mode: "lines", x, y: row(codes, state.tau, turn), name, line: { dash, color: colour, width: 2 },
