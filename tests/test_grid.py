@@ -581,6 +581,7 @@ def test_drift_and_noise_act_in_turns_where_the_noise_is_weak(problem, split):
     """The forces of Duffing and Swingup grow in the margin of the mesh, where they ask for no shorter steps. The noise
     of Hasty is weak beside its largest speed alone, which is not that of the first candidate."""
     assert GridSolver(problem, points=11, estimate=False).solve().split == split
+    assert not GridSolver(problem, points=11, estimate=False, turns=False).solve().split
 
 
 class Conveyor(ReachAvoidProblem):

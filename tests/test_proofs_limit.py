@@ -250,10 +250,11 @@ def test_wrong_bounds_are_one_sentence(value, trained, in_process):
 
 
 @pytest.mark.slow
-def test_two_states_have_an_upper_bound():
+@pytest.mark.parametrize("settings", [Settings(), Settings(cells=32, steps=30)])
+def test_two_states_have_an_upper_bound(settings):
     """It is above V of a grid, whose error is below 0.03, and no control violates it."""
     problem = Pendulum()
-    limit = prove_limit(problem, Settings(cells=32, steps=30))
+    limit = prove_limit(problem, settings)
     assert limit.holds
     assert not limit.resisted
     tau, x, _ = sampled(problem, 2_000, 4)

@@ -44,6 +44,7 @@ class GridSolver:
         levels: number of levels of each control among the candidates, at least 2; the default follows from the
             problem, see `pirl_rl.grid.candidates`.
         estimate: whether the problem is solved with half the points and steps, too, for an estimate of the error.
+        turns: whether drift and noise may act in turns, where the noise is weak beside the mesh.
 
     Raises:
         ArgumentError: with the argument, what was expected and what was got.
@@ -57,6 +58,7 @@ class GridSolver:
         margin: Sequence[float] | None = None,
         levels: int | None = None,
         estimate: bool = True,
+        turns: bool = True,
     ):
         n = problem.states.dim
         if n not in POINTS:
@@ -72,6 +74,7 @@ class GridSolver:
         if self.margin.shape != (n,) or not (self.margin >= 0).all():
             raise ArgumentError(f"margin: expected {n} numbers >= 0, got {margin}")
         self.problem, self.steps, self.levels, self.estimate = problem, steps, levels, estimate
+        self.turns = turns
 
     @property
     def resolves_target(self) -> bool:
@@ -141,7 +144,7 @@ class GridSolver:
     def _scheme(self, mesh: Mesh, x: np.ndarray, controls: np.ndarray) -> tuple[int, bool]:
         """The number of steps, and whether drift and noise act in turns, at nodes x (M, n) with controls (K, M, m)."""
         steps = max(self.points) if self.steps is None else self.steps
-        if not is_weak(self.problem, mesh, x, controls):
+        if not (self.turns and is_weak(self.problem, mesh, x, controls)):
             return steps, False
         if self.steps is None:
             # A force that grows outside the box of states, in the margin of the mesh, must not rule the steps out.

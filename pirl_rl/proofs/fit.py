@@ -30,6 +30,12 @@ RAISE = 1.2
 LARGEST = 2.0
 """The largest size of W outside A and B for which the mesh resolves it; its exact values are between 0 and 1."""
 
+WIDER = 1
+"""The number of further cells on each side in which the source is raised for boxes that resist.
+
+In their neighbours alone, as for points, what is missing moves to and fro between cells from round to round.
+"""
+
 SHARES = (1.0, 0.3, 0.1, 0.03)
 """The source is raised by the first of these shares for which the mesh resolves W."""
 
@@ -86,7 +92,7 @@ class Fit:
         for number in range(1, rounds + 1):
             announce(f"fitting a bound, round {number}")
             missing = self._missing()
-            if not missing.any() or not self.raise_in(missing):
+            if not missing.any() or not self._raise_in(missing, DEGREE):
                 break
 
     def on_boxes(self, boxes: Boxes, low: torch.Tensor) -> bool:
@@ -98,15 +104,19 @@ class Fit:
         missing = np.zeros(self.mesh.cells)
         cells = boxes.cell.T[: missing.ndim].numpy()
         np.maximum.at(missing, tuple(cells), (self._least - low).clamp(min=0).numpy())
-        return self.raise_in(missing)
+        return self._raise_in(missing, DEGREE + 2 * WIDER)
 
-    def raise_in(self, missing: np.ndarray) -> bool:
-        """Raise the source by what is missing in each cell (cells of tau, cells of each state) and its neighbours.
+    def _raise_in(self, missing: np.ndarray, width: int) -> bool:
+        """Raise the source by what is missing in each cell (cells of tau, cells of each state) and those around it.
+
+        Args:
+            missing: what is missing.
+            width: the number of cells along each state, with that in which it is missing in the middle.
 
         Returns:
             Whether W is bounded with the raised source; otherwise the source is left as it is.
         """
-        around = maximum_filter(missing, size=(1, *[DEGREE] * (missing.ndim - 1)), mode="constant")
+        around = maximum_filter(missing, size=(1, *[width] * (missing.ndim - 1)), mode="constant")
         padded = np.pad(around, [(1, 1), *[(0, 0)] * (missing.ndim - 1)], mode="edge")
         levels = np.maximum(padded[:-1], padded[1:])
         raised = RAISE * np.stack([level[self._own_cells] for level in levels])
