@@ -25,21 +25,22 @@ PACKAGES = ("pirl_rl", "torch", "torchrl", "tensordict", "numpy")
 TRIM, MAP = -1, -3
 """The numbers of the parameters M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of `mallopt`, a function of the GNU C library."""
 
-LARGEST, KEPT = 2**28, 2**29
-"""Arrays of at most so many bytes take over the memory of others, and at most so many bytes wait for them."""
+LARGEST_KEPT, MOST_KEPT = 2**28, 2**29
+"""The size in bytes of the largest arrays whose memory is kept, and the free bytes at the end of the heap that stay."""
 
 
-def keep_freed_memory() -> None:
+def keep_freed_memory() -> bool:
     """Keep the memory of arrays that are freed, so that the next ones take it over, on Linux.
 
     The GNU C library gives arrays above 32 MB back to the system when they are freed, and the system fills the pages of
     the next one with zeros, which takes a quarter of the time of an HJB term with 100 states and 100 noise channels.
-    Other C libraries are left as they are.
+
+    Returns:
+        Whether memory is kept. Other C libraries, and versions of this one that refuse the size, are left as they are.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
-    if mallopt is not None:
-        mallopt(MAP, LARGEST)
-        mallopt(TRIM, KEPT)
+    # A threshold alone would end the library's own adaptation to the sizes that it sees.
+    return mallopt is not None and bool(mallopt(MAP, LARGEST_KEPT)) and bool(mallopt(TRIM, MOST_KEPT))
 
 
 def record_session(run: RunDirectory, arguments: Sequence[str], device: torch.device | str) -> None:
