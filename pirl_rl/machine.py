@@ -33,7 +33,7 @@ def keep_freed_memory() -> bool:
     """Keep the memory of arrays that are freed, so that the next ones take it over, on Linux.
 
     The GNU C library gives arrays above 32 MB back to the system when they are freed, and the system fills the pages of
-    the next one with zeros, which takes a quarter of the time of an HJB term with 100 states and 100 noise channels.
+    the next one with zeros. An HJB term with 100 noise channels would spend much of its time on this.
 
     Returns:
         Whether memory is kept. Other C libraries, and versions of this one that refuse the size, are left as they are.

@@ -25,6 +25,7 @@ from pirl_rl.commands.console import quiet_libraries, reported
 from pirl_rl.commands.directory import begin, new_directory, show
 from pirl_rl.commands.train import prepare, reopened
 from pirl_rl.errors import INTERRUPTED, Interrupted
+from pirl_rl.machine import keep_freed_memory
 from pirl_rl.population import Population
 from pirl_rl.trainer import Trainer
 
@@ -51,6 +52,7 @@ def train_together(commands: Sequence[dict[str, Any]]) -> None:
         Interrupted: on SIGINT, after a checkpoint of each run.
         ArgumentError: the runs differ in more than a population can train, see `Population`.
     """
+    keep_freed_memory()
     members: list[Member] = []
     with contextlib.ExitStack() as stack:
         for command in commands:
