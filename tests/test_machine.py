@@ -27,7 +27,7 @@ def page_faults(kept: bool) -> tuple[bool, int]:
 
 
 def test_arrays_take_over_the_memory_of_those_that_were_freed():
-    """A page has at most 2 MB, so that ten arrays of 64 MB touch at least 320 new ones unless they take over old ones."""
+    """A page has at most 2 MB, so that ten arrays of 64 MB touch at least 320 new ones, or take over old ones."""
     keeps, faults = page_faults(kept=True)
     if not keeps:
         pytest.skip("the C library does not keep memory")
