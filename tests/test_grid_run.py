@@ -9,10 +9,12 @@ import pytest
 import torch
 
 import pirl_rl
+from pirl_rl.commands.export import export
 from pirl_rl.commands.train import resume
 from pirl_rl.errors import ArgumentError, CheckpointError, ConfigError
 from pirl_rl.grid import GridSolution, GridSolver
 from pirl_rl.problems import CartPole, DubinsCar, HalfSpace, Reach1D, ZermeloBoat
+from pirl_rl.runs.compare import find_runs
 
 SMALL = {"grid": {"points": 81}}
 SMALL |= {
@@ -88,6 +90,18 @@ def test_what_a_grid_cannot_do_is_said(run, folder, tmp_path, capsys):
     with pytest.raises(SystemExit):
         resume(folder, [])
     assert "holds the solution of a grid" in capsys.readouterr().err
+
+
+def test_a_grid_is_exported_and_compared(run, folder, tmp_path):
+    x = np.linspace(-1.9, 1.9, 20)[:, None]
+    assert export(folder, tmp_path / "copy") == tmp_path / "copy" / "grid.npz"
+    assert np.array_equal(pirl_rl.load_run(tmp_path / "copy").value(1.5, x), run.value(1.5, x))
+    (groups,) = find_runs([tmp_path]).values()
+    assert groups[0].get("success_rate") == json.loads((folder / "summary.json").read_text())["success_rate"]
+    (tmp_path / "copy" / "grid.npz").unlink()
+    with pytest.raises(CheckpointError, match="no grid at"):
+        export(tmp_path / "copy", tmp_path / "other")
+    assert not (tmp_path / "other").exists()
 
 
 def test_a_broken_or_foreign_file_is_refused(tmp_path):

@@ -128,6 +128,15 @@ def test_compare_writes_table_and_figure(runs, tmp_path, capsys):
     assert imread(tmp_path / "out" / "comparison.png").std() > 0.01
 
 
+def test_compare_takes_the_members_of_a_population(tmp_path):
+    """Its own directory has a summary and a configuration, and no rows of metrics."""
+    make_run(tmp_path, "pirl", 7, value_mse=1e-4)
+    (tmp_path / "pirl-7" / "metrics.csv").unlink()
+    for seed in range(2):
+        make_run(tmp_path / "pirl-7", "pirl", seed, value_mse=1e-4 * (seed + 1))
+    assert [run.get("value_mse") for run in compare.find_runs([tmp_path])["reach1d pirl"]] == [1e-4, 2e-4]
+
+
 def test_compare_draws_median_and_range(runs):
     figure = draw_comparison(compare.find_runs([runs]))
     axes = next(axes for axes in figure.axes if axes.get_title() == "Held-out td_loss")

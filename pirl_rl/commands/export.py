@@ -3,8 +3,9 @@
     python -m pirl_rl.export run=RUN_DIR out=FOLDER [format=run|onnx|torch]
 
 As a run, copies the files that `load_run` and a reader need: the networks without target networks, replay buffer and
-optimisers, the configuration, the summary, the certificate, the metrics and the figures. As a model, writes V, its
-gradient and the policy as one function of the time to go and the state, which needs nothing of this package.
+optimisers, or the mesh of a grid; the configuration, the summary, the certificate, the metrics and the figures. As a
+model, writes V, its gradient and the policy as one function of the time to go and the state, which needs nothing of
+this package.
 
     run     the run directory
     out     a new folder
@@ -33,7 +34,7 @@ from pirl_rl.checkpoint import TARGET
 from pirl_rl.commands.console import program, reported
 from pirl_rl.configuration import load_config, save_config
 from pirl_rl.deployment import FORMATS, write_model
-from pirl_rl.errors import ConfigError
+from pirl_rl.errors import CheckpointError, ConfigError
 from pirl_rl.run_directory import RunDirectory
 from pirl_rl.runs.load import load_run
 
@@ -47,6 +48,7 @@ COPIED = (
     RunDirectory.LIMIT_BOUND,
     RunDirectory.METRICS,
     RunDirectory.FIGURES,
+    RunDirectory.GRID,
 )
 
 
@@ -58,15 +60,18 @@ def export(run: Path, out: Path) -> Path:
         out: the folder, which must not exist.
 
     Returns:
-        The path of the exported networks.
+        The path of the exported networks, or of the grid.
 
     Raises:
         ConfigError: if `run` is not a run directory, or `out` exists.
-        CheckpointError: if the checkpoint is missing or broken.
+        CheckpointError: if the checkpoint or the grid is missing or broken.
     """
     config = load_config(run)
     source = RunDirectory(run)
-    state = checkpoint.load(source.newest())
+    of_grid = config.get("grid") is not None
+    if of_grid and not source.grid.is_file():
+        raise CheckpointError(f"no grid at {source.grid}")
+    state = None if of_grid else checkpoint.load(source.newest())
     source.refuse_links()
     if "start" in config:
         config.start = None  # a path that means nothing elsewhere
@@ -123,12 +128,14 @@ def _drafted(out: Path) -> Iterator[Path]:
         raise
 
 
-def _write(source: RunDirectory, config: DictConfig, state: dict[str, Any], copy: RunDirectory) -> Path:
-    """Write the files of an export; returns the path of the networks."""
+def _write(source: RunDirectory, config: DictConfig, state: dict[str, Any] | None, copy: RunDirectory) -> Path:
+    """Write the files of an export; returns the path of the networks, or without their state that of the grid."""
     save_config(config, copy.path)
-    loss = {name: entry for name, entry in checkpoint.loss_state(state).items() if not name.startswith(TARGET)}
-    path = copy.weights(state["update"])
-    checkpoint.save({"loss": loss, "update": state["update"]}, path)
+    path = copy.grid
+    if state is not None:
+        loss = {name: entry for name, entry in checkpoint.loss_state(state).items() if not name.startswith(TARGET)}
+        path = copy.weights(state["update"])
+        checkpoint.save({"loss": loss, "update": state["update"]}, path)
     for name in COPIED:
         if (source.path / name).is_dir():
             shutil.copytree(source.path / name, copy.path / name)

@@ -54,7 +54,7 @@ class RunRecord(NamedTuple):
     Attributes:
         label: its group, "experiment method".
         summary: the entries of summary.json.
-        metrics: the columns (rows,) of metrics.csv, by name.
+        metrics: the columns (rows,) of metrics.csv, by name; none where the run logs nothing, as that of a grid.
     """
 
     label: str
@@ -84,6 +84,9 @@ def find_runs(folders: Sequence[str | Path]) -> dict[str, list[RunRecord]]:
     for folder in map(Path, folders):
         found = [path.parent for path in sorted(folder.rglob(str(RunDirectory.SUMMARY)))]
         found = [path for path in found if RunDirectory(path).config.is_file()]
+        # The directory of a population has no rows of metrics; its members are the runs.
+        held = {parent for path in found for parent in path.parents}
+        found = [path for path in found if path not in held or RunDirectory(path).metrics.is_file()]
         if not found:
             raise RunError(
                 f"no runs found below {folder}: expected directories with {RunDirectory.SUMMARY} and "
@@ -107,7 +110,7 @@ def read_run(path: Path) -> RunRecord:
         config = OmegaConf.load(run.config)
         names = [OmegaConf.select(config, key, throw_on_missing=True) for key in ("experiment_name", "method_name")]
         summary = run.numbers()
-        metrics = read_metrics(run.metrics)
+        metrics = read_metrics(run.metrics) if run.metrics.is_file() else {}
     except (OSError, ValueError, OmegaConfBaseException) as error:
         raise RunError(f"{path} cannot be read: {error}") from error
     if None in names:
