@@ -270,10 +270,15 @@ class Trainer:
 
     def _enter_stage(self) -> None:
         """Take over what the stage of the next update sets, and the run's own for the rest."""
-        settings = self.curriculum.stage(self.update).over(self._run_settings)
-        self.collector.play(settings.initial_states, settings.n_steps, settings.exploration_noise)
+        settings = self._play(self.update)
         self.batches.collocation = settings.collocation
         self.learner.apply(settings)
+
+    def _play(self, update: int) -> StageSettings:
+        """Let the collector play as the stage of an update says; returns the settings of the stage."""
+        settings = self.curriculum.stage(update).over(self._run_settings)
+        self.collector.play(settings.initial_states, settings.n_steps, settings.exploration_noise)
+        return settings
 
     def _row(self, k: int, terms: Mapping[str, Tensor]) -> dict[str, float]:
         """The metrics of an update, on those that log; empty on others."""
@@ -341,6 +346,8 @@ class Trainer:
         self.update, self.saved, self.wall_seconds = state["update"], state["update"], state["wall_seconds"]
         self.learner.load_state_dict(state["learner"])
         self._recordings.forget()
+        # Initial states that were drawn ahead are those of the stage of the last update.
+        self._play(max(self.update - 1, 0))
         self.collector.load_state_dict(state["collector"])
         if self.rollback is not None and state.get("rollback") is not None:
             self.rollback.load_state_dict(state["rollback"])

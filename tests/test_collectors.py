@@ -172,6 +172,32 @@ def test_sizes_are_checked(kind, setting, message, tmp_path):
         small_trainer(tmp_path, f"collector={kind}", setting)
 
 
+class Started:
+    """Stands for TorchRL's collector, and notes the seeds that it gets."""
+
+    procs, seeds = (), []
+
+    def __init__(self, *args, **kwargs):
+        pass
+
+    def set_seed(self, seed: int) -> None:
+        self.seeds.append(seed)
+
+    def start(self) -> None:
+        pass
+
+    async_shutdown = start
+
+
+def test_a_later_start_of_the_workers_has_other_seeds(tmp_path, monkeypatch):
+    collector = small_trainer(tmp_path, "collector=multi_async", "collector.warmup_frames=1").collector
+    monkeypatch.setattr("torchrl.collectors.MultiAsyncCollector", Started)
+    for _ in range(2):
+        collector.buffer.extend(TensorDict({"index": torch.arange(64)}, batch_size=[64]))
+        collector.start()
+    assert len(set(Started.seeds)) == 2
+
+
 def test_workers_feed_resume_die_and_leave_nothing(tmp_path):
     """One start of processes for all that needs them: the rest of a worker's life in its order."""
     first = small_trainer(tmp_path, *ASYNC, "trainer.updates=4", "method=pirl")

@@ -49,6 +49,14 @@ def test_a_stage_s_schedule_counts_the_stage_s_own_updates():
         assert curriculum.progress(k) == own.progress(k - 25, 75)
 
 
+def test_a_stage_may_be_too_short_for_an_update():
+    """Two updates for three stages leave none to the last, whose weights are asked for all the same."""
+    own = LossSchedule([1, 0, 0], [0, 1, 1], center=0.5, steepness=10)
+    curriculum = Curriculum(WHOLE, 2, [Stage(1), Stage(1), Stage(0.5, own, learning_rate=0.1)])
+    assert len(curriculum.largest_weights()) == 3
+    assert curriculum.decay(2) == 0
+
+
 def test_each_stage_has_one_first_update():
     curriculum = Curriculum(WHOLE, 30, [Stage(1)] * 3)
     assert [k for k in range(30) if curriculum.is_first(k)] == [0, 10, 20]
@@ -103,7 +111,9 @@ POLICY = (
 )
 
 
-@pytest.mark.parametrize(("stages", "stop", "end"), [(STAGES, 7, 10), (POLICY, 6, 12)], ids=["starts", "noise"])
+@pytest.mark.parametrize(
+    ("stages", "stop", "end"), [(STAGES, 3, 10), (STAGES, 7, 10), (POLICY, 6, 12)], ids=["own", "run", "noise"]
+)
 def test_resume_inside_a_stage_is_exact(stages, stop, end, tmp_path):
     small_trainer(tmp_path / "whole", *stages).train()
     stopped = small_trainer(tmp_path / "cut", *stages)

@@ -138,7 +138,7 @@ class MultiAsyncCollector:
             ) from None
         self.buffer.set_rng(self._rng)
         lock_writes_with(self.buffer, _WatchedLock(self._write_lock, self._check_workers))
-        self._collector.set_seed(self._seed)
+        self._collector.set_seed(first)
         self._collector.start()
         self._delivered_at = time.monotonic()
         while len(self.buffer) < min(self.warmup_frames, self.buffer.storage.max_size):
