@@ -20,6 +20,9 @@ from pirl_rl.ascent import Objective, ascend
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
+TINY = torch.finfo(torch.float32).tiny
+"""The smallest square of a slope that counts."""
+
 Flow = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Maps states (N, n), controls (N, m) and lengths (N,), in s, to the states (N, n) after a step without noise."""
 
@@ -89,22 +92,23 @@ def continued_value(solution: Solution, tau: Tensor, x: Tensor) -> Tensor:
         tau: times to go (*), in s.
         x: states (*, n).
     """
-    problem = solution.problem
+    problem, box = solution.problem, solution.problem.states
+    y = x = box.wrap(x)
     failed, reached = problem.failed(x), problem.reached(x)
-    y = x
     if problem.has_avoid_set:
         y = torch.where(failed.unsqueeze(-1), _mirrored(problem.avoid_level, x), y)
     if problem.objective == "reach-avoid":
         y = torch.where(reached.unsqueeze(-1), _mirrored(lambda z: problem.reached_constraints(z).amax(-1), x), y)
     # Networks take one axis of points: stacked critics have an axis of their own before it.
-    value = solution.value(tau.flatten(), y.flatten(0, -2)).reshape(tau.shape)
+    value = solution.value(tau.flatten(), box.wrap(y).flatten(0, -2)).reshape(tau.shape)
     return torch.where(reached, 2 - value, torch.where(failed, -value, value))
 
 
 def _mirrored(level: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
     """The states (*, n), mirrored at the zero of a level, to first order in the level."""
     slope = torch.func.grad(lambda y: level(y).sum())(x)
-    return x - 2 * level(x).unsqueeze(-1) * slope / slope.square().sum(-1, keepdim=True).clamp(min=1e-12)
+    # Levels may have any unit: only a slope of 0 leaves a state where it is.
+    return x - 2 * level(x).unsqueeze(-1) * slope / slope.square().sum(-1, keepdim=True).clamp(min=TINY)
 
 
 def value_ahead(

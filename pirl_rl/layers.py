@@ -118,9 +118,11 @@ class LogLevels(nn.Module):
 
     def logs(self, levels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """asinh(l / w) of levels (*, N, k), and its first and second derivatives, likewise."""
+        # The ratio has no unit, while powers of levels in small or large units may leave the range of single precision.
         width = self.width.unsqueeze(-2)
-        slope = (levels.square() + width.square()).rsqrt()
-        return torch.asinh(levels / width), slope, -levels * slope**3
+        ratio = levels / width
+        slope = (1 + ratio.square()).rsqrt()
+        return torch.asinh(ratio), slope / width, -ratio * slope**3 / width / width
 
     def forward(self, z: Tensor) -> Tensor:
         logs = torch.asinh(self.of(z) / self.width.unsqueeze(-2))

@@ -193,6 +193,20 @@ def test_the_value_is_continued_through_faces_as_an_odd_function():
         assert torch.allclose((own + beyond) / 2, torch.tensor(value), atol=1e-5)
 
 
+def test_the_continuation_does_not_depend_on_the_unit_of_levels():
+    """A level of 1e-8 per m, as of a set of the size of a continent, is mirrored like one of 3 per m."""
+
+    class Flat(Channel):
+        def avoid_level(self, x: Tensor) -> Tensor:
+            return 1e-8 * (x[..., 0] + 1)
+
+    x, tau = torch.stack([-1 - torch.rand(50), torch.rand(50)], -1), torch.full((50,), 0.5)
+    own = solution_of(Channel())
+    expected = continued_value(own, tau, x)
+    found = continued_value(Solution(Flat(), own.actor, own.critic), tau, x)
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
+
+
 class Straight:
     """V = (1 + x_1)/2 between the sets, where noise neither helps nor harms: V is a martingale for any of it."""
 

@@ -135,6 +135,16 @@ def test_a_sigmoid_of_logarithms_is_a_layer_of_any_width():
         torch.testing.assert_close(layer, level / (level + width), atol=1e-3, rtol=0)
 
 
+@pytest.mark.parametrize("unit", [1e-15, 1.0, 1e15])
+def test_derivatives_of_logarithms_stay_in_single_precision_in_any_unit(unit):
+    """Against double precision, for levels in m^2 of sets of the size of a cell or of the solar system."""
+    level, width = unit * torch.logspace(-4, 2, 50, dtype=torch.float64).unsqueeze(-1), torch.tensor([0.01 * unit])
+    single, double = LogLevels(width).logs(level.float()), LogLevels(width).double().logs(level)
+    for one, other in zip(single, double, strict=True):
+        assert one.isfinite().all()
+        torch.testing.assert_close(one.double(), other, rtol=1e-5, atol=0)
+
+
 def test_logarithms_of_levels_need_levels():
     with pytest.raises(ArgumentError, match="log_levels: expected levels=true"):
         Critic(Reach1D(), log_levels=True)

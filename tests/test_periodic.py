@@ -10,14 +10,17 @@ import torch
 from oracles import Circle, FullNoise, Winding, name, points, random_solution
 
 import pirl_rl
+from pirl_rl import ReachAvoidProblem
+from pirl_rl.action_values import continued_value
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.evaluation.trajectories import closed_loop
 from pirl_rl.layers import Periodic
-from pirl_rl.networks import Actor, Critic
+from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.operators import generator
 from pirl_rl.problems import Reach1D
 from pirl_rl.sets import Box
 from pirl_rl.simulator import Simulator
+from pirl_rl.solution import Solution
 
 
 def uniform(low: float, high: float, *shape: int):
@@ -240,3 +243,34 @@ def test_levels_beyond_the_period_are_those_within_it():
     level = circle.within_period(lambda x: x[..., 0].abs())
     x = torch.tensor([[0.5, 9.0], [1.25, 9.0], [-1.75, 9.0]])
     assert level(x).tolist() == [0.5, 0.75, 0.25]
+
+
+class Lighthouse(ReachAvoidProblem):
+    """A beam on a circle, whose target is written for angles in [0, 2 pi) alone, with noise that the control sets."""
+
+    horizon = 1.0
+    states, controls = Box([0.0], [2 * math.pi], periodic=[0]), Box([0.0], [1.0])
+
+    def drift(self, x, u):
+        return torch.sin(x)
+
+    def diffusion(self, x, u):
+        return u.unsqueeze(-1)
+
+    def target_level(self, x):
+        return torch.minimum(x[..., 0], 2 * math.pi - x[..., 0]) - 0.3
+
+
+def test_the_continuation_into_a_set_knows_the_period():
+    """V inside of the target is 2 - V at the mirrored state, also where that lies beyond the end of the period."""
+    torch.manual_seed(0)
+    problem = Lighthouse()
+    solution = Solution(problem, Actor(problem), stack([Critic(problem)]))
+    x = torch.linspace(0.0, 6.2, 50).unsqueeze(-1)
+    tau = torch.full((50,), 0.5)
+    inside = continued_value(solution, tau, x)
+    for turns in (-1, 1):
+        torch.testing.assert_close(continued_value(solution, tau, x + turns * 2 * math.pi), inside, atol=1e-5, rtol=0)
+    mirrored = 0.6 - x[x[:, 0] < 0.3]
+    own = solution.value(tau[: len(mirrored)], mirrored)
+    torch.testing.assert_close(inside[: len(mirrored)], 2 - own, atol=1e-5, rtol=0)

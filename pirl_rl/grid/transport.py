@@ -171,15 +171,17 @@ def _flow(problem: ReachAvoidProblem, mesh: Mesh, x: torch.Tensor, u: torch.Tens
     """Where paths without noise from x (M, n) are after dt.
 
     Returns:
-        The states (M, n), whether the paths entered A or B before (M,), and the value of the first of these sets (M,).
+        The states (M, n) within their periods, whether the paths entered A or B before (M,), and the value of the first
+        of these sets (M,).
     """
+    wrap = problem.states.wrap
     cells = np.abs(problem.drift(x, u).numpy() / mesh.spacing).max() * dt
     looks = max(1, int(np.ceil(LOOKS * cells)))
     h, ended, end = dt / looks, np.zeros(len(x), bool), np.zeros(len(x))
     for _ in range(looks):
-        middle = x + problem.drift(x, u) * (h / 2)
-        x = x + problem.drift(middle, u) * h
-        inside, value = absorbed(problem, problem.states.wrap(x).numpy())
+        middle = wrap(x + problem.drift(x, u) * (h / 2))
+        x = wrap(x + problem.drift(middle, u) * h)
+        inside, value = absorbed(problem, x.numpy())
         end = np.where(inside & ~ended, value, end)
         ended = ended | inside
     return x, ended, end
@@ -206,12 +208,11 @@ def _passed(
 
     Paths that the flow leads into a set and out of it again have its value.
     """
-    moved = problem.states.wrap(moved)
-    path = x, moved, problem.diffusion(x, u), torch.full_like(x[:, 0], dt)
-    avoid = problem.avoid_constraints if problem.has_avoid_set else None
+    path, within = (x, moved, problem.diffusion(x, u), torch.full_like(x[:, 0], dt)), problem.states.within_period
     if problem.objective == "reach-avoid":
-        succeeded = entrance_probability(problem.target_constraints, avoid, *path)
+        avoid = within(problem.avoid_constraints) if problem.has_avoid_set else None
+        succeeded = entrance_probability(within(problem.target_constraints), avoid, *path)
     else:
-        succeeded = (1 - passage_probability(problem.avoid_constraints, *path)).prod(-1)
+        succeeded = (1 - passage_probability(within(problem.avoid_constraints), *path)).prod(-1)
     inside = torch.where(torch.from_numpy(end > 0), problem.reached(moved), problem.failed(moved))
     return np.where(ended & ~inside.numpy(), end, succeeded.numpy())
