@@ -42,6 +42,8 @@ from pirl_rl.proofs.search import prove
 from pirl_rl.proofs.spline import Spline, design, knots_of
 from pirl_rl.sets import Box
 
+MATRIX = torch.tensor([[0.5, -1.0], [2.0, 0.25]], dtype=torch.float64)
+
 FUNCTIONS = {
     "abs": lambda z: z.abs(),
     "atan": torch.atan,
@@ -65,6 +67,10 @@ FUNCTIONS = {
     "cancellation": lambda z: (1 + z) - z,
     "norm": lambda z: torch.stack([z, 2 * z + 1], -1).norm(dim=-1),
     "maximum": lambda z: torch.maximum(z, -z * z),
+    "row times matrix": lambda z: (torch.stack([z, z.sin()], -1) @ MATRIX)[..., 1],
+    "row times vector": lambda z: torch.stack([z, z.sin()], -1) @ MATRIX[0],
+    "matrix times column": lambda z: (MATRIX @ torch.stack([z, z.sin()], -1).unsqueeze(-1))[..., 1, 0],
+    "vector norm": lambda z: torch.linalg.vector_norm(torch.stack([z, 2 * z + 1], -1), dim=-1),
 }
 
 
@@ -478,6 +484,8 @@ def test_a_proof_is_read_for_its_networks_alone(tmp_path):
     assert (LowerBound.load(tmp_path / "proof.npz", Reach1D(), "a" * 64).bound(*points) == proof.bound(*points)).all()
     with pytest.raises(ProofError, match="networks with SHA-256 aaaaaaaaaaaa, and those of this run have bbbbbbbbbbbb"):
         LowerBound.load(tmp_path / "proof.npz", Reach1D(), "b" * 64)
+    with pytest.raises(ProofError, match="about a problem with other drift, noise, sets, controls or horizon"):
+        LowerBound.load(tmp_path / "proof.npz", Reach1D(horizon=1.0), "a" * 64)
     (tmp_path / "proof.npz").write_bytes(b"no proof")
     with pytest.raises(ProofError, match="expected a file of `certify method=interval`"):
         LowerBound.load(tmp_path / "proof.npz", Reach1D(), "a" * 64)
@@ -589,3 +597,40 @@ def test_a_wrong_command_is_one_sentence(arguments, message, trained, in_process
     assert code == 1
     assert "Traceback" not in text
     assert message in text
+
+
+def test_products_without_an_enclosure_are_refused():
+    form = Affine.of_box(torch.zeros(3, 2, dtype=torch.float64), torch.ones(3, 2, dtype=torch.float64))
+    with pytest.raises(ProofError, match="both depend on the state"):
+        form.unsqueeze(-2) @ form.unsqueeze(-1)
+    with pytest.raises(ProofError, match=r"expected a matrix \(k, l\) and columns"):
+        MATRIX @ form
+    with pytest.raises(ProofError, match="expected the Euclidean norm of order 2, got order 1"):
+        torch.linalg.vector_norm(form, ord=1, dim=-1)
+
+
+def test_the_size_of_the_units_does_not_hide_another_problem(tmp_path):
+    """In nanometres, written in m, everything is smaller than any absolute tolerance."""
+
+    class Small(Reach1D):
+        scale, noise = 1e-9, 1.0
+        states = Box([-2e-9], [2e-9])
+
+        def drift(self, x, u):
+            return self.scale * u
+
+        def diffusion(self, x, u):
+            return torch.full((*x.shape, 1), self.noise * self.scale, dtype=x.dtype)
+
+        def target_level(self, x):
+            return 2e-9 - x[..., 0]
+
+    edges = [np.linspace(0, 2, 3), np.linspace(-2e-9, 2.4e-9, 45)]
+    spline = Spline(edges, np.ones([len(axis) + 2 for axis in edges]))
+    proof = LowerBound(problem=Small(), spline=spline, margin=0.1, resisted={}, boxes=0, seconds=0.0, networks="none")
+    proof.save(tmp_path / "proof.npz")
+    other = Small()
+    other.noise = 1.2
+    assert LowerBound.load(tmp_path / "proof.npz", Small(), "none").margin == 0.1
+    with pytest.raises(ProofError, match="about a problem with other drift"):
+        LowerBound.load(tmp_path / "proof.npz", other, "none")

@@ -80,12 +80,17 @@ class Affine:
     @property
     def low(self) -> Tensor:
         """A lower bound (N, *)."""
-        return self.centre - self.spread - 2 * ROUNDING * self.magnitude
+        return self.centre - self.spread - self._slack
 
     @property
     def high(self) -> Tensor:
         """An upper bound (N, *)."""
-        return self.centre + self.spread + 2 * ROUNDING * self.magnitude
+        return self.centre + self.spread + self._slack
+
+    @property
+    def _slack(self) -> Tensor:
+        """A bound (N, *) of the rounding errors of the sums in `spread`, `low` and `high`."""
+        return (len(self.slopes) + 4) * ROUNDING * self.magnitude
 
     # Structure, as of a tensor of shape (N, *)
 
@@ -222,12 +227,18 @@ class Affine:
         return Affine(*(torch.where(condition, a, b) for a, b in parts))
 
     def matmul(self, matrix: Tensor) -> Affine:
-        """The product (N, k) of forms (N, l) with a matrix (l, k)."""
+        """The product (N, *, k) of forms (N, *, l) with a matrix (l, k), or (N, *) with a vector (l,)."""
+        if isinstance(matrix, Affine):
+            raise ProofError("matmul: the product of two matrices that both depend on the state has no enclosure")
+        if matrix.ndim == 1:
+            return self.matmul(matrix.unsqueeze(-1))[..., 0]
         matrix = matrix.to(torch.float64)
         size = matrix.abs()
         terms = (matrix.shape[-2] + 4) * ROUNDING
         radius = self.radius @ size + terms * (self.magnitude @ size)
         return Affine(self.centre @ matrix, self.slopes @ matrix, radius)
+
+    __matmul__ = matmul
 
     def sum(self, dim: int = -1, keepdim: bool = False) -> Affine:
         """The sum over an axis other than the leading one, counted from the end."""

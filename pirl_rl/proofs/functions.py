@@ -156,10 +156,26 @@ def _extreme(pairwise: Callable[[Affine, Affine], Affine]) -> Callable[..., Affi
     return reduced
 
 
-def _norm(z: Affine, p: Any = None, dim: Any = -1, keepdim: bool = False, **_: Any) -> Affine:
+def _matmul(a: Affine | Tensor, b: Affine | Tensor) -> Affine:
+    """The product of forms with a matrix, or of a matrix (k, l) with columns (N, l, j) of forms."""
+    if isinstance(a, Affine):
+        return a.matmul(b)  # type: ignore[arg-type]
+    assert isinstance(b, Affine)
+    if a.ndim != 2 or b.ndim < 3:
+        raise ProofError(
+            f"matmul: expected a matrix (k, l) and columns (N, l, j), got shapes {tuple(a.shape)} and {tuple(b.shape)}"
+        )
+    return b.map(_transposed).matmul(a.mT).map(_transposed)
+
+
+def _transposed(entry: Tensor) -> Tensor:
+    return entry.mT
+
+
+def _norm(z: Affine, p: Any = None, dim: Any = -1, keepdim: bool = False, ord: Any = None, **_: Any) -> Affine:
     """The Euclidean norm; where it can be 0 in a box, an interval."""
-    if p not in (None, 2, "fro"):
-        raise ProofError(f"norm: expected the Euclidean norm, p = 2, got p = {p!r}")
+    if not {p, ord} <= {None, 2, "fro"}:
+        raise ProofError(f"norm: expected the Euclidean norm of order 2, got order {ord if p is None else p!r}")
     squares = _square(z).sum(dim if isinstance(dim, int) else dim[0], keepdim=keepdim)
     low, high = squares.low.clamp(min=0).sqrt(), squares.high.clamp(min=0).sqrt()
     interval = Affine((low + high) / 2, torch.zeros_like(squares.slopes), (high - low) / 2 + 1e-15 * high)
@@ -214,8 +230,9 @@ FUNCTIONS.update(
         "amax": _extreme(_maximum),
         "amin": _extreme(_minimum),
         "norm": _norm,
-        "vector_norm": _norm,
+        "linalg_norm": _norm,
+        "linalg_vector_norm": _norm,
         "sum": lambda z, dim=-1, keepdim=False: z.sum(dim, keepdim),
-        "matmul": lambda a, b: a.matmul(b),
+        "matmul": _matmul,
     }
 )

@@ -37,7 +37,7 @@ COMPARED = 64
 """The number of states and controls at which the physics of a problem is compared with that of a file."""
 
 SAME = 1e-9
-"""The relative difference of the physics at these states that counts as rounding."""
+"""The difference of the physics at these states that counts as rounding, relative to the largest value there."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +62,7 @@ class Proof(ABC):
 
     METHOD: ClassVar[str] = "affine arithmetic and Taylor models on the HJB inequality, branch and bound"
     TRIVIAL: ClassVar[int]
+    REPEATED: ClassVar[str] = ""
 
     @abstractmethod
     def bound(self, tau: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -107,6 +108,10 @@ class Proof(ABC):
             "resisted": {name: boxes.centre[:LISTED].tolist() for name, boxes in self.resisted.items()},
         }
 
+    def save(self, path: Path) -> None:
+        """Write the proved bound to one file of numpy arrays, with what it is about."""
+        self._save(path)
+
     def _save(self, path: Path, **about: Any) -> None:
         edges = {f"edges_{axis}": values for axis, values in enumerate(self.spline.edges)}
         numbers = np.array([self.margin, self.boxes, self.seconds])
@@ -116,28 +121,37 @@ class Proof(ABC):
                 allow_pickle=False,
                 coefficients=self.spline.coefficients.numpy(),
                 numbers=numbers,
+                physics=physics_of(self.problem),
                 **edges,  # type: ignore[arg-type]
                 **about,
             )
 
-    @staticmethod
-    def _read(path: str | Path, about: str) -> tuple[dict[str, Any], np.ndarray]:
-        """The fields of a proof but the problem, without the boxes that resisted; and what it is about.
+    @classmethod
+    def _read(
+        cls, path: str | Path, problem: ReachAvoidProblem, *about: str
+    ) -> tuple[dict[str, Any], list[np.ndarray]]:
+        """The fields of a proof, without the boxes that resisted; and further arrays of the file by their names.
 
         Raises:
-            ProofError: the file is missing, or not a proof of this kind.
+            ProofError: the file is missing or not a proof of this kind, or it is about another problem.
         """
         try:
             with np.load(path) as file:
                 arrays = {name: file[name] for name in file.files}
-            subject, (margin, boxes, seconds) = arrays[about], arrays["numbers"].tolist()
+            subjects, physics = [arrays[name] for name in about], arrays["physics"]
+            margin, boxes, seconds = arrays["numbers"].tolist()
             spline = Spline(
                 [arrays[f"edges_{axis}"] for axis in range(arrays["coefficients"].ndim)], arrays["coefficients"]
             )
         except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
             raise ProofError(f"{path}: expected a file of `certify method=interval`, got {error}") from None
-        fields = {"spline": spline, "margin": margin, "resisted": {}, "boxes": int(boxes), "seconds": seconds}
-        return fields, subject
+        if not _are_equal(physics, problem):
+            raise ProofError(
+                f"{path}: it proves something about a problem with other drift, noise, sets, controls or horizon than "
+                f"{type(problem).__name__}; prove again with method=interval{cls.REPEATED}"
+            )
+        fields = {"problem": problem, "spline": spline, "margin": margin, "resisted": {}}
+        return fields | {"boxes": int(boxes), "seconds": seconds}, subjects
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,7 +183,6 @@ class LowerBound(Proof):
         }
 
     def save(self, path: Path) -> None:
-        """Write the proved bound to one file of numpy arrays."""
         self._save(path, networks=self.networks)
 
     @classmethod
@@ -182,15 +195,15 @@ class LowerBound(Proof):
             networks: the SHA-256 of the networks to which the bound is to apply.
 
         Raises:
-            ProofError: the file is missing or not a proof, or it is about other networks.
+            ProofError: the file is missing or not a proof, or it is about other networks or another problem.
         """
-        fields, found = cls._read(path, "networks")
+        fields, [found] = cls._read(path, problem, "networks")
         if str(found) != networks:
             raise ProofError(
                 f"{path}: it proves something about networks with SHA-256 {str(found)[:12]}, and those of this run "
                 f"have {networks[:12]}; prove again with method=interval"
             )
-        return cls(problem=problem, networks=networks, **fields)
+        return cls(networks=networks, **fields)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,6 +214,7 @@ class UpperBound(Proof):
     """
 
     TRIVIAL = 1
+    REPEATED = " bounds=[upper]"
 
     def bound(self, tau: np.ndarray, x: np.ndarray) -> np.ndarray:
         return 1 - self._least(tau, x)
@@ -222,10 +236,6 @@ class UpperBound(Proof):
             **{f"share_below_{level:g}": float((1 - failure < level).mean()) for level in LEVELS},
         }
 
-    def save(self, path: Path) -> None:
-        """Write the proved bound to one file of numpy arrays, with the physics at some states."""
-        self._save(path, physics=physics_of(self.problem))
-
     @classmethod
     def load(cls, path: str | Path, problem: ReachAvoidProblem) -> UpperBound:
         """Read a proved bound, without the boxes that resisted.
@@ -237,18 +247,24 @@ class UpperBound(Proof):
         Raises:
             ProofError: the file is missing or not an upper bound, or it is about another problem.
         """
-        fields, found = cls._read(path, "physics")
-        physics = physics_of(problem)
-        if found.shape != physics.shape or not np.allclose(found, physics, rtol=SAME, atol=SAME):
-            raise ProofError(
-                f"{path}: it proves something about a problem with other drift, noise, sets, controls or horizon than "
-                f"{type(problem).__name__}; prove again with method=interval bounds=[upper]"
-            )
-        return cls(problem=problem, **fields)
+        return cls(**cls._read(path, problem)[0])
 
 
 def physics_of(problem: ReachAvoidProblem) -> np.ndarray:
     """Numbers (k,) by which problems differ: boxes, horizon and objective; drift, noise and levels at some states."""
+    return np.concatenate(_physics(problem))
+
+
+def _are_equal(found: np.ndarray, problem: ReachAvoidProblem) -> bool:
+    """Whether numbers (k,) are `physics_of` a problem, up to rounding at the size of each function."""
+    parts = _physics(problem)
+    size = np.concatenate([np.full(len(part), np.abs(part).max(initial=0.0)) for part in parts])
+    physics = np.concatenate(parts)
+    return found.shape == physics.shape and bool((np.abs(found - physics) <= SAME * size).all())
+
+
+def _physics(problem: ReachAvoidProblem) -> list[np.ndarray]:
+    """The parts of `physics_of`."""
     rng = torch.Generator().manual_seed(0)
     x = problem.states.sample(COMPARED, rng, torch.float64)
     u = problem.controls.sample(COMPARED, rng, torch.float64)
@@ -257,10 +273,12 @@ def physics_of(problem: ReachAvoidProblem) -> np.ndarray:
         for box in (problem.states, problem.controls)
         for end in (box.low, box.high)
     ]
-    scalars = torch.tensor([problem.horizon, float(problem.objective == "invariance")], dtype=torch.float64)
-    values = [*boxes, scalars, problem.drift(x, u), problem.diffusion(x, u)]
+    scalars = [
+        torch.tensor([value], dtype=torch.float64) for value in (problem.horizon, problem.objective == "invariance")
+    ]
+    values = [*boxes, *scalars, problem.drift(x, u), problem.diffusion(x, u)]
     if problem.objective == "reach-avoid":
         values.append(problem.target_constraints(x))
     if problem.has_avoid_set:
         values.append(problem.avoid_constraints(x))
-    return torch.cat([value.double().flatten() for value in values]).numpy()
+    return [value.double().flatten().numpy() for value in values]

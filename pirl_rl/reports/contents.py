@@ -69,6 +69,7 @@ class Contents:
         figures: the figures as addresses, with their sizes.
         left_out: names of figures that did not fit.
         networks: the SHA-256 of the policy and V.
+        proved: whether what was proved about a policy is about these networks and this problem.
         limited: whether what was proved about all policies is about this problem.
         sessions: how the run was made, see `pirl_rl.machine`.
         overrides: the overrides of its command line; empty where they are not known.
@@ -83,6 +84,7 @@ class Contents:
     figures: dict[str, dict[str, Any]]
     left_out: list[str]
     networks: str
+    proved: bool
     limited: bool
     sessions: list[dict[str, Any]]
     overrides: list[str]
@@ -115,6 +117,7 @@ class Contents:
             figures=figures,
             left_out=[path.stem for path in drawn if path.stem not in figures],
             networks=networks,
+            proved=_proof(directory, run.problem, networks) is not None,
             limited=_limit(directory, run.problem) is not None,
             sessions=read_sessions(directory),
             overrides=_overrides(directory),
@@ -186,12 +189,18 @@ def _data(run: Run, directory: RunDirectory, networks: str, budget: Budget) -> d
         return found | {"planes": plane_maps(solution, planes_of(solution), budget.maps)}
     # A proof that was made for other networks or another problem is shown in words alone, which say so.
     bounds: dict[str, Any] = {}
-    if directory.bound.is_file() and read_json(directory.proof).get("networks") == networks:
-        bounds["lower"] = LowerBound.load(directory.bound, run.problem, networks).bound
-    limit = _limit(directory, run.problem)
-    if limit is not None:
-        bounds["upper"] = limit.bound
+    for name, proof in (("lower", _proof(directory, run.problem, networks)), ("upper", _limit(directory, run.problem))):
+        if proof is not None:
+            bounds[name] = proof.bound
     return found | {"line": line_maps(solution, bounds)}
+
+
+def _proof(directory: RunDirectory, problem: ReachAvoidProblem, networks: str) -> LowerBound | None:
+    """What was proved about the policy; None where there is nothing about these networks and this problem."""
+    try:
+        return LowerBound.load(directory.bound, problem, networks)
+    except ProofError:
+        return None
 
 
 def _limit(directory: RunDirectory, problem: ReachAvoidProblem) -> UpperBound | None:

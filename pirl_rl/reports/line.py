@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from pirl_rl.problem import closed_form
 from pirl_rl.reports.maps import MOST_CONTROLS, evaluated
 from pirl_rl.reports.names import as_html, state_names
 from pirl_rl.reports.packing import packed, quantised
@@ -29,7 +30,7 @@ def line_maps(
     x = torch.linspace(problem.states.low[0], problem.states.high[0], POINTS, dtype=torch.float64)
     pairs = tau.repeat_interleave(POINTS), problem.states.wrap(x.repeat(TAUS).unsqueeze(-1))
     curves = {"value": evaluated(solution, solution.value, *pairs)}
-    exact = problem.exact_value(*pairs)
+    exact = closed_form(problem, *pairs)
     if exact is not None:
         curves["exact"] = exact.numpy()
     interior = problem.interior(pairs[1]).numpy()

@@ -248,7 +248,7 @@ class Run:
         """The bound that `certify method=interval` wrote to a file `proof.npz`.
 
         Raises:
-            ProofError: the file cannot be read, or it is about other networks than those of this run.
+            ProofError: the file cannot be read, or it is about other networks or another problem than this run's.
         """
         return LowerBound.load(path, self.problem, self._digest())
 
