@@ -2,11 +2,12 @@
 
     python benchmarks/dimension.py [--rounds 15] [--eager] [--short] [--json FILE] [--figure FILE]
 
-The problem is the half-space of the suite with its noise spread over w channels, and critic and actor have the sizes of
-the default recipe, 3 x 64 and 2 x 64. A term is this loss alone, forward and backward, on one thread: the exact trace
-has a column for each channel, the randomised one the number of random vectors that trainings take. Beside each stand
-the products of matrices that it needs, in `torch.matmul` of equal shapes with nothing between them. The exponents are
-those of power laws, fitted to the three largest values of N, w or n; all other sizes stay at their largest.
+The problem is the half-space of the suite with its noise spread over w channels. The critic has three layers of 64 and
+the actor two, half the width of those of the default recipe, and the critic has no logarithms of the levels. A term is
+this loss alone, forward and backward, on one thread: the exact trace has a column for each channel, the randomised one
+the number of random vectors that trainings take. Beside each stand the products of matrices that it needs, in
+`torch.matmul` of equal shapes with nothing between them. The exponents are those of power laws, fitted to the three
+largest values of N, w or n; all other sizes stay at their largest.
 
 Times are those of the processor, which leave out the waits for other processes, and the smallest of rounds in which all
 cases take turns. `--eager` leaves the terms of the sweeps uncompiled. `--short` measures one case alone, uncompiled and

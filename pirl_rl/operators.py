@@ -42,6 +42,9 @@ from pirl_rl.sigma import times
 
 ValueFunction = Callable[[Tensor, Tensor], Tensor]
 
+BITS = 8
+"""The number of random signs in a random byte."""
+
 
 def _tanh(z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     y = torch.tanh(z)
@@ -110,7 +113,11 @@ def rademacher(count: int, x: Tensor, channels: int) -> Tensor:
 
     Among all laws of independent entries they give the trace the smallest variance; for one channel it is exact.
     """
-    return torch.where(torch.rand(count, len(x), channels, dtype=x.dtype, device=x.device) < 0.5, -1.0, 1.0).to(x)
+    # The bits of random bytes take a tenth of the time of as many random numbers.
+    kind = {"dtype": torch.uint8, "device": x.device}
+    sample = torch.randint(2**BITS, (count, len(x), -(-channels // BITS)), **kind)
+    bits = (sample.unsqueeze(-1) >> torch.arange(BITS, **kind)) & 1
+    return bits.flatten(-2)[..., :channels].to(x.dtype).mul_(2).sub_(1)
 
 
 def _along(value: ValueFunction, tau: Tensor, x: Tensor, f: Tensor, columns: Tensor) -> Tensor:

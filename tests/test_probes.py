@@ -101,6 +101,14 @@ def test_probes_are_independent_signs():
     torch.testing.assert_close(flat.mT @ flat / 20_000, torch.eye(4).double(), rtol=0, atol=4 / 20_000**0.5)
 
 
+def test_probes_of_many_channels_are_independent_signs_too():
+    """They come from several random bytes each; of 5,000 correlations none is above six standard errors, 6/50."""
+    torch.manual_seed(0)
+    flat = rademacher(1, torch.zeros(2_500, 3), 100)[0]
+    assert (flat.abs() == 1).all()
+    torch.testing.assert_close(flat.mT @ flat / 2_500, torch.eye(100), rtol=0, atol=6 / 50)
+
+
 # The loss
 
 
