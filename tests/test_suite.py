@@ -155,6 +155,9 @@ def test_the_command_goes_on_where_it_stopped(tmp_path, capsys, monkeypatch):
     with pytest.raises(SystemExit):
         main([*SMALL, "seeds=[3]", "trainer.updates=30"])
     assert re.search(r"out: expected a new directory.*trainer\.updates=30", capsys.readouterr().err)
+    with pytest.raises(SystemExit):
+        main([*SMALL, "seeds=[5]", "env.problem.horizon=0.5"])
+    assert re.search(r"out: .*truth-50\.pt is the truth of the problem with no settings", capsys.readouterr().err)
 
 
 def test_the_table_and_the_figure_have_all_runs_of_the_folder(tmp_path, capsys, monkeypatch):

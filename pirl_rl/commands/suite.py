@@ -133,15 +133,29 @@ def _options(arguments: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
 def _truth(folder: Path, name: str, overrides: Sequence[str], states: int) -> Truth:
     """The truth of a problem, from its file in the folder if it is there."""
     path = _truth_file(folder, states)
+    changes = sorted(text for text in overrides if text.lstrip("+").startswith("env.problem"))
     if path.is_file():
-        return Truth(**torch.load(path, weights_only=True))
+        truth, known = _read_truth(path)
+        if known != changes:
+            raise ConfigError(
+                f"out: {path} is the truth of the problem with {' '.join(known) or 'no settings'}, expected one with "
+                f"{' '.join(changes) or 'no settings'}; give another folder, with out=DIR"
+            )
+        return truth
     problem = make_problem(compose("train", [*PROBLEMS[name], *overrides]))
     print(f"{name}: the truth at {states} states", flush=True)
     truth = find_truth(problem, states, STATES_SEED)
     folder.mkdir(parents=True, exist_ok=True)
     with replacing(path, binary=True) as file:
-        torch.save(asdict(truth), file)
+        torch.save(asdict(truth) | {"changes": changes}, file)
     return truth
+
+
+def _read_truth(path: Path) -> tuple[Truth, list[str]]:
+    """The truth in a file, and the settings that changed its problem."""
+    entries = torch.load(path, weights_only=True)
+    changes = entries.pop("changes", [])
+    return Truth(**entries), changes
 
 
 def _truth_file(folder: Path, states: int) -> Path:
@@ -156,7 +170,7 @@ def _measured(folder: Path, options: dict[str, Any]) -> tuple[dict[str, list[Sco
         known = _truth_file(folder / name, options["states"])
         if not known.is_file():
             continue
-        truth = Truth(**torch.load(known, weights_only=True))
+        truth, _ = _read_truth(known)
         file = _score_file(truth, options["rollouts"])
         seeds = sorted(int(run.name) for run in (folder / name).glob("[0-9]*") if (run / file).is_file())
         paths = [folder / name / str(seed) / file for seed in seeds]
