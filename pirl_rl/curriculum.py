@@ -133,7 +133,7 @@ class Curriculum:
         if self.stage(update).learning_rate is None:
             return update / self.updates
         first, end = self._bounds(update)
-        return (update - first) / (end - first)
+        return (update - first) / max(end - first, 1)
 
     def _bounds(self, update: int) -> tuple[int, int]:
         """The first update of the stage of an update, and the first update after that stage."""
@@ -147,4 +147,4 @@ class Curriculum:
         if own is None:
             return self.schedule, update, self.updates
         first, end = self._bounds(update)
-        return own, update - first, end - first
+        return own, update - first, max(end - first, 1)

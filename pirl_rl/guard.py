@@ -109,7 +109,8 @@ class Rollback:
         Raises:
             ArgumentError: no evaluation of success during training, by which it could judge.
         """
-        success = next((one for one in during.values() if isinstance(one, Success)), None)
+        # Of several, the metrics of the last one stand in the rows that are judged.
+        success = next((one for one in reversed([*during.values()]) if isinstance(one, Success)), None)
         if success is None or not evaluate_every:
             raise ArgumentError(
                 "trainer.rollback: it judges evaluations during training, expected trainer.evaluate_every >= 1 and "

@@ -197,6 +197,11 @@ class ReachAvoidProblem(ABC):
         return alive * self.payoff(_normalized(self.free_target_constraints, x).amax(-1))
 
 
+def closed_form(problem: ReachAvoidProblem, tau: Tensor, x: Tensor) -> Tensor | None:
+    """V (*) by `exact_value`, which is about the indicator; None where it is not known, and for a smoothed payoff."""
+    return problem.exact_value(tau, x) if problem.payoff.epsilon == 0 else None
+
+
 def _normalized(levels, x: Tensor) -> Tensor:
     """g/|grad g| (*, k) of each of the k levels: the signed distance to the surface g = 0, to first order."""
     value, pullback = torch.func.vjp(levels, x)  # type: ignore[misc]

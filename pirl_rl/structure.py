@@ -132,6 +132,10 @@ def check_problem(problem: ReachAvoidProblem) -> None:
     sigma = problem.diffusion(few, u)
     if sigma.ndim != 3:
         raise ProblemError(f"{name}.diffusion: expected shape (*, {n}, w), got {tuple(sigma.shape)} for 16 states")
+    if sigma.shape[-1] == 0:
+        raise ProblemError(
+            f"{name}.diffusion: expected at least one column, got none; without noise it is one of zeros"
+        )
     _expect_shape(f"{name}.diffusion", sigma, (16, n, sigma.shape[-1]))
     _expect_shape(f"{name}.avoid_level", problem.avoid_level(few), (16,))
     if problem.objective == "reach-avoid":

@@ -246,6 +246,35 @@ class TwoTargets(DoubleIntegrator):
         return x.norm(dim=-1) - 0.1
 
 
+class OnOff(DoubleIntegrator):
+    def drift(self, x, u):
+        return super().drift(x, u.sign())
+
+
+class RandomNoise(ZermeloBoat):
+    def diffusion(self, x, u):
+        return 1e-10 * torch.randn(1, dtype=x.dtype) * super().diffusion(x, u)
+
+
+class FarFromTheOrigin(HalfSpace):
+    """Metres in a grid of the map: single precision has steps of half a metre there."""
+
+    horizon = 100.0
+
+    def __init__(self):
+        super().__init__(dim=2)
+        self.states = Box([5_400_000.0, 0.0], [5_400_100.0, 100.0])
+
+    def target_level(self, x):
+        return 5_400_080.0 - x[..., 0]
+
+    def exact_value(self, tau, x):
+        return None
+
+    def optimal_control(self, tau, x):
+        return None
+
+
 FAULTS = [
     (WrongShape, "error", "drift", "expected shape"),
     (DoublePrecision, "error", "drift", "float32"),
@@ -269,6 +298,9 @@ FAULTS = [
     (ReversedAvoid, "warning", "avoid_level", "must be <= 0 inside"),
     (Indicator, "warning", "target_level", "derivative is 0"),
     (DetachedLevel, "warning", "target_level", "derivative is 0"),
+    (OnOff, "warning", "drift", "derivative is 0"),
+    (RandomNoise, "error", "diffusion", "random numbers"),
+    (FarFromTheOrigin, "warning", "states", "along axis 0 .* apart in single precision"),
     (RandomDrift, "error", "drift", "random numbers"),
     (KeepsCount, "error", "drift", "keeps a state"),
     (NoControl, "warning", "drift", "no control changes"),

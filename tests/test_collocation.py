@@ -290,6 +290,14 @@ def test_points_near_visited_ones_move_with_the_schedule(progress):
     assert torch.equal(points["mask"], sampler.mask(points["tau"], points["state"]))
 
 
+def test_times_to_go_stay_within_the_horizon_however_far_they_move():
+    problem = Reach1D()
+    replay = TensorDict({"tau": torch.full((50, 1), 1.9), "state": torch.zeros(50, 1)}, batch_size=[50])
+    points = ReplayCollocation(problem, 4_000, jitter=(3.0, 3.0)).sample(make_rng(), replay, 0.5)
+    assert 0 <= points["tau"].min() < 0.1
+    assert problem.horizon - 0.1 < points["tau"].max() <= problem.horizon
+
+
 def test_without_a_replay_all_points_are_uniform():
     problem = Reach1D()
     assert_equal_points(ReplayCollocation(problem, 50).sample(make_rng()), Collocation(problem, 50).sample(make_rng()))

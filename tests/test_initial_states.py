@@ -9,9 +9,9 @@ import pytest
 import torch
 from oracles import PROBLEMS, name
 
-from pirl_rl.errors import ProblemError
+from pirl_rl.errors import ArgumentError, ProblemError
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.problems import RadialExit, Reach1D, Safety1D, VehicleDrift
+from pirl_rl.problems import RadialExit, Reach1D, Safety1D, VehicleDrift, ZermeloBoat
 from pirl_rl.problems.drift.starts import EquilibriumStates
 from pirl_rl.sampling.faces import NearFaces
 from pirl_rl.sampling.initial_states import UniformStates, VisitedStates, sample_interior
@@ -42,6 +42,11 @@ def test_uniform_over_what_is_left_of_the_box():
     assert x.max() < 2
     assert x.mean().item() == pytest.approx(0, abs=5 * (4 / 3 / COUNT) ** 0.5)
     assert x.var().item() == pytest.approx(4 / 3, abs=5 * (64 / 45 / COUNT) ** 0.5)
+
+
+def test_a_box_of_starts_must_have_the_states_of_the_problem():
+    with pytest.raises(ArgumentError, match="initial_states: expected low and high of 2 numbers, one a state, got 1"):
+        draw(ZermeloBoat(), UniformStates([-1.0], [1.0]))
 
 
 def test_tau_fixed_or_uniform():

@@ -216,3 +216,12 @@ def test_wrong_arguments_are_named(change, named):
     arguments = {"tau": 1.0, "x": torch.zeros(3, 1)} | change
     with pytest.raises(ValueError, match=named):
         monte_carlo(REACH, REACH.optimal_control, **arguments)
+
+
+def test_without_time_steps_those_of_a_training_are_taken():
+    """A horizon of milliseconds needs no step from the caller; V within four standard errors of 4,000 paths."""
+    problem = Reach1D(horizon=5e-3)
+    x = torch.tensor([[1.95], [1.99]])
+    estimate = monte_carlo(problem, problem.optimal_control, 5e-3, x, rollouts=4_000)
+    exact = problem.exact_value(torch.full((2,), 5e-3), x)
+    assert (estimate.probability - exact).abs().max() < 4 * 0.5 / 4_000**0.5

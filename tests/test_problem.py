@@ -10,12 +10,23 @@ import torch
 from oracles import PROBLEMS, SHIPPED, Corner, FullNoise, name
 from torch import Tensor
 
+from pirl_rl.checking import examine
 from pirl_rl.errors import ArgumentError, ProblemError
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.operators import generator
 from pirl_rl.payoffs import LipschitzPayoff
-from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.problems import DubinsCar, Exit1D, HalfSpace, Pendulum, RadialExit, Reach1D, Safety1D, ZermeloBoat
+from pirl_rl.problem import ReachAvoidProblem, closed_form
+from pirl_rl.problems import (
+    DoubleIntegrator,
+    DubinsCar,
+    Exit1D,
+    HalfSpace,
+    Pendulum,
+    RadialExit,
+    Reach1D,
+    Safety1D,
+    ZermeloBoat,
+)
 from pirl_rl.sets import Box
 from pirl_rl.structure import check_problem, has_controlled_noise
 
@@ -327,3 +338,24 @@ def test_a_smoothed_target_has_no_states_of_the_avoid_set():
     assert inside.any()
     assert not (inside & problem.failed(x)).any()
     assert x[inside].min() >= 2.6 - 1e-6
+
+
+def test_a_system_without_noise_has_one_column_of_zeros():
+    still = DoubleIntegrator(position_noise=0.0, speed_noise=0.0)
+    check_problem(still)
+    assert torch.equal(still.diffusion(torch.ones(3, 2), torch.zeros(3, 1)), torch.zeros(3, 2, 1))
+
+    class NoColumn(DoubleIntegrator):
+        def diffusion(self, x, u):
+            return x.unsqueeze(-1)[..., :0]
+
+    with pytest.raises(ProblemError, match=r"NoColumn\.diffusion: expected at least one column, got none"):
+        check_problem(NoColumn())
+
+
+def test_a_closed_form_is_that_of_the_indicator():
+    problem, tau, x = Exit1D(), torch.ones(3), torch.zeros(3, 1)
+    assert torch.equal(closed_form(problem, tau, x), problem.exact_value(tau, x))
+    problem.payoff = LipschitzPayoff(0.2)
+    assert closed_form(problem, tau, x) is None
+    assert not [finding for finding in examine(problem) if finding.level == "error"]

@@ -34,6 +34,7 @@ from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.inputs import like, points_rng
 from pirl_rl.evaluation.monte_carlo import expected_deviation
 from pirl_rl.evaluation.rollout_comparison import RolloutComparison
+from pirl_rl.problem import closed_form
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
@@ -114,7 +115,7 @@ def _described(name: str, part: Part, confidence: float) -> str:
 
 def _exact_error(field: Field, tau: Tensor, x: Tensor) -> tuple[dict[str, float | None], str] | None:
     """The error of V where the exact value is known, which is that of the indicator."""
-    exact = field.problem.exact_value(tau, x) if field.problem.payoff.epsilon == 0 else None
+    exact = closed_form(field.problem, tau, x)
     if exact is None:
         return None
     error = field.value(tau, x) - exact

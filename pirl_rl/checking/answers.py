@@ -8,6 +8,7 @@ import torch
 
 from pirl_rl.checking.findings import Finding, found
 from pirl_rl.checking.samples import Samples, defines
+from pirl_rl.problem import closed_form
 
 ROUNDING = 1e-4
 """Deviations of probabilities that count as rounding, also of a series in single precision."""
@@ -21,7 +22,7 @@ def exact_value(samples: Samples) -> Iterator[Finding]:
     x = x[problem.interior(x)]
     for tau in (0.0, problem.horizon / 3, problem.horizon):
         times = torch.full((len(x),), tau, dtype=x.dtype)
-        value = problem.exact_value(times, x)
+        value = closed_form(problem, times, x)
         if value is None:
             return
         if value.shape != times.shape:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -30,6 +31,9 @@ PART = 0.38
 
 THIN = 2.0
 """Moves in one integration step, in depths of a set, from which paths jump over the set."""
+
+COARSE = 0.1
+"""The distance of two numbers in single precision, in the largest move of an integration step, that is too large."""
 
 
 def controls(samples: Samples) -> Iterator[Finding]:
@@ -123,6 +127,7 @@ def steps(samples: Samples, dt: float | None, substeps: int | None) -> Iterator[
         )
         yield found(problem, "warning", "drift", message)
     h = chosen.dt / chosen.substeps
+    yield from _precision(samples, h)
     for move in chosen.moves[1:]:
         if max(move.speed * h, move.spread * h**0.5) > THIN:
             message = (
@@ -130,6 +135,23 @@ def steps(samples: Samples, dt: float | None, substeps: int | None) -> Iterator[
                 f"{move.spread * h**0.5:.2g} of the depth of {move.across}, which is thinner than a step."
             )
             yield found(problem, "warning", "target_level" if "target" in move.across else "avoid_level", message)
+
+
+def _precision(samples: Samples, h: float) -> Iterator[Finding]:
+    """Networks and paths are in single precision, which must resolve the moves of an integration step of length h."""
+    states = samples.problem.states
+    drift, sigma = _physics(samples, samples.x, samples.u)
+    moves = (drift.abs() * h + sigma.norm(dim=-1) * h**0.5).amax(0).tolist()
+    for axis, move in enumerate(moves):
+        farthest = max(abs(states.low[axis]), abs(states.high[axis]))
+        apart = float(np.spacing(np.float32(farthest)))
+        if 0 < move < apart / COARSE:
+            message = (
+                f"along axis {axis} paths move by at most {move:.2g} in an integration step of {h:.3g} s, and numbers "
+                f"near {farthest:.7g} are {apart:.2g} apart in single precision; measure the coordinate from a point "
+                "in the box, so that its numbers are small."
+            )
+            yield found(samples.problem, "warning", "states", message)
 
 
 def _physics(samples: Samples, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,7 @@ from torch import Tensor
 from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.evaluator import Metrics
 from pirl_rl.evaluation.inputs import like
-from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.problem import ReachAvoidProblem, closed_form
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
@@ -34,7 +34,7 @@ class ExactError:
         self.tau_points, self.x_points, self.seed = tau_points, x_points, seed
 
     def meanings(self, problem: ReachAvoidProblem) -> dict[str, str]:
-        if problem.exact_value(*self._points(problem)) is None:
+        if closed_form(problem, *self._points(problem)) is None:
             return {}
         where = f"{self.tau_points * self.x_points:,} random points of tau in [0, T] and x in the box of states"
         if problem.states.dim == 1:
@@ -50,7 +50,7 @@ class ExactError:
 
     def __call__(self, solution: Solution, simulator: Simulator) -> Metrics:
         tau, x = self._points(solution.problem)
-        exact = solution.problem.exact_value(tau, x)
+        exact = closed_form(solution.problem, tau, x)
         if exact is None:
             return Metrics({})
         inputs = like(solution, tau, x)

@@ -18,6 +18,7 @@ from pirl_rl.arguments import Policy, checked_points, checked_policy, seeded
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator, Step, exit_value
+from pirl_rl.time_steps import propose_time_steps
 
 Array = TypeVar("Array", float, np.ndarray, Tensor)
 
@@ -97,8 +98,8 @@ def monte_carlo(
     tau: float | Tensor | np.ndarray,
     x: Tensor | np.ndarray,
     rollouts: int = 1000,
-    dt: float = 0.01,
-    substeps: int = 1,
+    dt: float | None = None,
+    substeps: int | None = None,
     crossing: Literal["bridge", "endpoint"] = "bridge",
     seed: int = 0,
     confidence: float = 0.95,
@@ -114,8 +115,9 @@ def monte_carlo(
         tau: times to go (N,), or one number for all states, in s.
         x: states (N, n); arrays other than tensors are simulated in torch's default dtype.
         rollouts: number of paths from each state.
-        dt: longest control step in s; the step of a state is tau / ceil(tau / dt), so that whole steps fill tau.
-        substeps: number of integration steps in a control step.
+        dt: longest control step in s; the step of a state is tau / ceil(tau / dt), so that whole steps fill tau. The
+            default is that of a training, see `pirl_rl.time_steps`.
+        substeps: number of integration steps in a control step. The default is 1 with a given `dt`, else likewise.
         crossing: how exits within a step are detected, see `pirl_rl.simulator`.
         seed: seed of the noise; torch's global random generator is not used.
         confidence: confidence level of the interval, which is approximate (Wilson 1927).
@@ -129,7 +131,9 @@ def monte_carlo(
         raise ArgumentError(f"x: expected states of shape (N, {problem.states.dim}), got {tuple(points.shape)}")
     if not (isinstance(rollouts, int) and rollouts >= 1):
         raise ArgumentError(f"rollouts: expected an integer >= 1, got {rollouts!r}")
-    simulator = Simulator(problem, dt, substeps, crossing)
+    if dt is None:
+        dt, substeps = propose_time_steps(problem, substeps=substeps)[:2]
+    simulator = Simulator(problem, dt, 1 if substeps is None else substeps, crossing)
     rng = seeded(seed, points.device)
     mean = mean_payoff(simulator, checked_policy(policy, problem), times, points, rollouts, rng)
     known = _known(problem, times, problem.states.wrap(points))[0]

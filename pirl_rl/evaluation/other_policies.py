@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from pirl_rl.evaluation.monte_carlo import ENTRIES
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator, Step, exit_value
 
@@ -34,7 +35,7 @@ class OpenLoop(NamedTuple):
 
 @torch.no_grad()
 def play_open_loop(simulator: Simulator, tau: Tensor, x: Tensor, rollouts: int, seed: int) -> OpenLoop:
-    """Play constant and random controls from tau (N,) and x (N, n), all of them at once.
+    """Play constant and random controls from tau (N,) and x (N, n), as many at once as memory allows.
 
     Args:
         simulator: plays the paths.
@@ -43,9 +44,22 @@ def play_open_loop(simulator: Simulator, tau: Tensor, x: Tensor, rollouts: int, 
         rollouts: the number of paths of each control from each state; half of them choose the best constant.
         seed: of the noise, and of the random controls and vertices.
     """
-    problem, rng = simulator.problem, torch.Generator(x.device).manual_seed(seed)
-    actions = constant_actions(problem, seed).to(x)
-    groups, rollouts = len(actions) + 1, 2 * max(1, rollouts // 2)
+    rng = torch.Generator(x.device).manual_seed(seed)
+    actions, rollouts = constant_actions(simulator.problem, seed).to(x), 2 * max(1, rollouts // 2)
+    paths = max(1, ENTRIES // (x.shape[-1] * simulator.channels))
+    parts = max(1, paths // ((len(actions) + 1) * rollouts))
+    played = [
+        _played(simulator, actions, *states, rollouts, rng)
+        for states in zip(tau.split(parts), x.split(parts), strict=True)
+    ]
+    means = torch.cat(played, -1).cpu()
+    best = int(means[:-1, 0].mean(-1).argmax())
+    return OpenLoop(means[best, 1], actions[best], means[-1].mean(0))
+
+
+def _played(simulator: Simulator, actions: Tensor, tau: Tensor, x: Tensor, rollouts: int, rng: torch.Generator):
+    """The mean payoffs (K + 1, 2, N) of both halves of the rollouts of K constant actions (K, m) and of random ones."""
+    problem, groups = simulator.problem, len(actions) + 1
     steps = simulator.clock.split(tau)[0].clamp(min=1)
     shape = (groups, rollouts, len(x))
     left, now, h = (entry.expand(*shape, *entry.shape[1:]).flatten(0, 2) for entry in (steps, x, tau / steps))
@@ -61,9 +75,7 @@ def play_open_loop(simulator: Simulator, tau: Tensor, x: Tensor, rollouts: int, 
         if ended.any():
             payoff[rows[ended]] = exit_value(problem, Step(*(entry[ended] for entry in step))).double()
         now, left, rows = step.state[~ended], left[~ended], rows[~ended]
-    means = payoff.view(groups, 2, rollouts // 2, len(x)).mean(2).cpu()
-    best = int(means[:-1, 0].mean(-1).argmax())
-    return OpenLoop(means[best, 1], actions[best], means[-1].mean(0))
+    return payoff.view(groups, 2, rollouts // 2, len(x)).mean(2)
 
 
 def constant_actions(problem: ReachAvoidProblem, seed: int) -> Tensor:

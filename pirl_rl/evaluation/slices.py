@@ -67,11 +67,12 @@ class Section:
         """
         horizon = solution.problem.horizon
         times = [horizon / 2**k for k in range(HALVINGS + 1)]
-        sections = (cls.of(solution, plane, points, time) for time in times)
-        return next(
-            (section for section in sections if section.spread(solution.problem) >= SPREAD),
-            cls.of(solution, plane, points, horizon),
-        )
+        sections = []
+        for time in times:
+            sections.append(cls.of(solution, plane, points, time))
+            if sections[-1].spread(solution.problem) >= SPREAD:
+                return sections[-1]
+        return sections[0]
 
     @property
     def time(self) -> float:

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
+from pirl_rl.problem import closed_form
 from pirl_rl.solution import Solution
 
 ERROR_RANGE = (1e-4, 1.0)
@@ -41,7 +42,7 @@ def evaluate_on_grid(solution: Solution, taus: int = 101, states: int = 201) -> 
     tau = torch.linspace(0, problem.horizon, taus, dtype=torch.float64)
     x = torch.linspace(problem.states.low[0], problem.states.high[0], states, dtype=torch.float64)
     points = tau.repeat(states), problem.states.wrap(x.repeat_interleave(taus).unsqueeze(-1))
-    exact = problem.exact_value(*points)
+    exact = closed_form(problem, *points)
     inputs = [entry.to(solution.device, solution.dtype) for entry in points]
     shape = (states, taus)
     return Grid(

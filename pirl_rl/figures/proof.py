@@ -13,7 +13,7 @@ from pirl_rl.evaluation.inputs import like
 from pirl_rl.evaluation.planes import planes_of
 from pirl_rl.evaluation.slices import Section
 from pirl_rl.figures.planes import CONTOURS, draw_sets
-from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.problem import ReachAvoidProblem, closed_form
 from pirl_rl.proofs import LowerBound, UpperBound
 from pirl_rl.solution import Solution
 
@@ -40,7 +40,7 @@ def _curve(solution: Solution, bounds: Sequence[Bound]) -> Figure:
     figure = Figure(figsize=(5.6, 4.0), layout="constrained")
     axes = figure.subplots()
     axes.plot(x[:, 0], value.cpu(), label="learned V")
-    exact = problem.exact_value(tau, x)
+    exact = closed_form(problem, tau, x)
     if exact is not None:
         axes.plot(x[:, 0], exact, "k--", linewidth=1, label="exact V")
     for bound in bounds:

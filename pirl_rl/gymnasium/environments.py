@@ -69,15 +69,15 @@ class ReachAvoidVectorGym(VectorEnv):
 
     def step(self, actions: Array) -> tuple[Array, NDArray, NDArray, NDArray, dict[str, Any]]:
         """Advance all paths; `final_obs` in the information has the observations with which episodes ended."""
-        action = torch.as_tensor(np.clip(actions, -1.0, 1.0), dtype=torch.get_default_dtype())
+        action = torch.as_tensor(np.clip(actions, -1.0, 1.0), dtype=torch.get_default_dtype(), device=self.env.device)
         done, self._state = self.env.step_and_maybe_reset(self._state.set("action", action))
-        ended = done["next", "done"].squeeze(-1).numpy()
-        reward = done["next", "reward"].squeeze(-1).numpy().astype(np.float64)
+        ended = done["next", "done"].squeeze(-1).cpu().numpy()
+        reward = done["next", "reward"].squeeze(-1).cpu().numpy().astype(np.float64)
         infos = {"final_obs": self._observed(done["next"]), "_final_obs": ended} if ended.any() else {}
         return self._observed(self._state), reward, ended, np.zeros_like(ended), infos
 
     def _observed(self, state: TensorDictBase) -> Array:
-        return observation(self.env.problem, state["tau"].squeeze(-1), state["state"]).numpy().astype(np.float32)
+        return observation(self.env.problem, state["tau"].squeeze(-1), state["state"]).cpu().numpy().astype(np.float32)
 
 
 class ReachAvoidGym(gymnasium.Env[Array, Array]):

@@ -124,9 +124,9 @@ class ReplayCollocation(Collocation):
         device, horizon = rng.device, self.problem.horizon
         index = torch.randint(len(replay), (self.size,), generator=rng, device=device)
         step = jitter * torch.randn(self.size, 1 + self.problem.states.dim, generator=rng, device=device)
-        # tau is reflected at both ends of (0, T]: the critic takes its root, and NaN would reach the gradient even from
-        # a masked point.
-        tau = torch.abs(replay["tau"][index] + step[:, :1] * horizon / 2)
+        # tau is reflected at both ends of (0, T], as often as it takes: the critic takes its root, and NaN would reach
+        # the gradient even from a masked point.
+        tau = (replay["tau"][index] + step[:, :1] * horizon / 2).remainder(2 * horizon)
         tau = horizon - torch.abs(horizon - tau)
         states = self.problem.states
         state = states.wrap(states.denormalize(states.normalize(replay["state"][index]) + step[:, 1:]))

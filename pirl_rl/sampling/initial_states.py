@@ -90,7 +90,10 @@ class UniformStates:
         dtype: torch.dtype,
         visited: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        x = sample_interior(problem, self.box or problem.states, count, rng, dtype)
+        box, n = self.box or problem.states, problem.states.dim
+        if box.dim != n:
+            raise ArgumentError(f"initial_states: expected low and high of {n} numbers, one a state, got {box.dim}")
+        x = sample_interior(problem, box, count, rng, dtype)
         return steps_to_go(self.tau, count, max_steps, rng), x
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pirl_rl.grid import GridSolver
-from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.problem import ReachAvoidProblem, closed_form
 from pirl_rl.sampling.initial_states import sample_interior
 
 EARLIEST = 0.1
@@ -69,7 +69,7 @@ def find_truth(problem: ReachAvoidProblem, count: int, seed: int, points: Mappin
     rng = torch.Generator().manual_seed(seed)
     x = sample_interior(problem, problem.states, SPARE * count, rng, torch.float64)
     tau = problem.horizon * (EARLIEST + (1 - EARLIEST) * torch.rand(len(x), generator=rng, dtype=x.dtype))
-    exact = problem.exact_value(tau[:count], x[:count])
+    exact = closed_form(problem, tau[:count], x[:count])
     if exact is not None:
         return Truth(tau[:count], x[:count], exact, "exact")
     if problem.states.dim not in points or problem.states.dim + problem.controls.dim > LARGEST:
