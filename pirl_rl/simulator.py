@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from numbers import Real
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -105,12 +105,6 @@ class Simulator:
     def compiled(self) -> Simulator:
         """The same simulator with compiled sub-steps, which are compiled once however often it is asked for."""
         return replace(self, compile=True)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """The simulator without compiled programs, which cannot be sent to another process."""
-        return {name: value for name, value in vars(self).items() if name not in ("compiled", "_advanced")} | {
-            "shared": None
-        }
 
     def share(self, compiled: Simulator) -> None:
         """Let functions that play many paths take another simulator, which equals `self.compiled`.

@@ -6,8 +6,6 @@ Statistical tests have fixed seeds and ask for agreement within three standard e
 from __future__ import annotations
 
 import math
-import pickle
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +15,6 @@ import torch
 from oracles import PROBLEMS, Corner, FullNoise, name, points
 from torch import Tensor
 
-from pirl_rl.compilation import Compiled
 from pirl_rl.networks import Critic
 from pirl_rl.operators import generator
 from pirl_rl.problems import Reach1D, Safety1D, ZermeloBoat
@@ -295,21 +292,3 @@ def test_physics_that_cannot_be_compiled_run_eagerly_and_the_line_is_named():
     ):
         step = simulator.step(x, u, torch.Generator().manual_seed(0))
     assert torch.equal(step.state, Simulator(Branching(), 0.1).step(x, u, torch.Generator().manual_seed(0)).state)
-
-
-def test_a_compiled_simulator_is_sent_without_its_programs():
-    """Compiled programs cannot be pickled; the copy makes its own, and its steps are those of the original."""
-    simulator = Simulator(ZermeloBoat(), 0.1, 2, "bridge", compile=True)
-    assert isinstance(simulator._advanced, Compiled)
-    simulator.share(simulator.compiled)
-    copied = pickle.loads(pickle.dumps(simulator))
-    settings = ("dt", "substeps", "crossing", "compile")
-    assert [getattr(copied, one) for one in settings] == [getattr(simulator, one) for one in settings]
-    assert copied.shared is None
-    assert not {"_advanced", "compiled"} & {*vars(copied)}
-    x = sample_interior(ZermeloBoat(), ZermeloBoat().states, 20, torch.Generator().manual_seed(0), torch.float32)
-    plain = [
-        replace(one, compile=False).step(x, torch.zeros(20, 2), torch.Generator().manual_seed(1)).state
-        for one in (simulator, copied)
-    ]
-    assert torch.equal(*plain)
