@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import re
 from collections.abc import Iterator
 from os import PathLike
@@ -86,7 +87,18 @@ def _refuse_resolvers(value: Any, key: str) -> None:
         raise ConfigError(f"{key}: a run directory may refer to its own keys only, got {value}; write the value itself")
 
 
+def _concrete(node: Any, raw: Any) -> None:
+    """Replace what `_refuse_resolvers` refuses, as a value from the environment, by its value."""
+    for name, inner in raw.items() if isinstance(raw, dict) else enumerate(raw):
+        if isinstance(inner, (dict, list)):
+            _concrete(node[name], inner)
+        elif isinstance(inner, str) and "${" in REFERENCE.sub("", inner):
+            node[name] = node[name]
+
+
 def save_config(config: DictConfig, folder: str | Path) -> None:
-    """Write the configuration of a run directory for `load_config`."""
+    """Write the configuration of a run directory for `load_config`, with references to its own keys alone."""
+    config = copy.deepcopy(config)
+    _concrete(config, OmegaConf.to_container(config, resolve=False))
     with replacing(RunDirectory(folder).config) as file:
         file.write(f"format: {FORMAT}\n{OmegaConf.to_yaml(config)}")

@@ -12,7 +12,7 @@ from small import small_config, small_trainer
 from pirl_rl import load_run
 from pirl_rl.assembly import make_trainer
 from pirl_rl.building import build, resolve
-from pirl_rl.configuration import load_config
+from pirl_rl.configuration import load_config, save_config
 from pirl_rl.errors import ConfigError
 from pirl_rl.problems import Reach1D
 from pirl_rl.run_directory import RunDirectory
@@ -162,3 +162,14 @@ def test_unreadable_configurations(text, tmp_path):
     RunDirectory(tmp_path).config.write_text(text)
     with pytest.raises(ConfigError, match=r"config\.yaml"):
         load_config(tmp_path)
+
+
+def test_a_value_from_the_environment_is_saved_as_a_value(tmp_path, monkeypatch):
+    """A run directory refers to its own keys alone, so that it opens anywhere."""
+    monkeypatch.setenv("TASK_ID", "7")
+    config = small_config("experiment_name=${oc.env:TASK_ID}")
+    save_config(config, tmp_path)
+    saved = load_config(tmp_path)
+    assert saved.experiment_name == "7"
+    kept = OmegaConf.to_container(saved, resolve=False)
+    assert kept["critics"] == "${pirl.critics}"  # a reference to an own key stays one

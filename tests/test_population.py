@@ -12,7 +12,8 @@ from small import PHYSICS, QUICK, at_update, interrupt, small_config, small_trai
 import pirl_rl
 from pirl_rl import checkpoint, train
 from pirl_rl.assembly import make_trainer
-from pirl_rl.commands.train import resume
+from pirl_rl.commands.train import go_on, resume
+from pirl_rl.configuration import save_config
 from pirl_rl.continuation import restore
 from pirl_rl.errors import ArgumentError, Interrupted
 from pirl_rl.population import Population
@@ -225,3 +226,12 @@ def test_python_trains_a_population(tmp_path):
     runs = pirl_rl.train("reach1d", seeds=[0, 1], folder=tmp_path / "out", debug="default", report=False, figures=False)
     assert [run.config.seed for run in runs] == [0, 1]
     assert runs[0].update > 0
+
+
+def test_modules_that_a_resuming_command_names_are_trusted(tmp_path, monkeypatch):
+    """A population of one's own problem is resumed by the line that it printed, with trust=[my_module]."""
+    seen = []
+    save_config(small_config("trainer.seeds=[0,1]"), tmp_path)
+    monkeypatch.setattr("pirl_rl.commands.train.resume_population", lambda *arguments: seen.append(arguments[3]))
+    go_on(tmp_path, ["trust=[my_module]"], ["another"])
+    assert seen == [["my_module", "another"]]

@@ -185,7 +185,11 @@ def go_on(folder: Path, overrides: Sequence[str], trust: Sequence[str] = ()) -> 
     if config.trainer.get("seeds") is not None:
         RunDirectory(folder).refuse_links()
         with locked(RunDirectory(folder)):
-            return resume_population(config, folder, overrides, [*named_modules(overrides), *trust])
+            config.trust = []
+            for text in overrides:
+                if text.startswith("trust="):
+                    override(config, text)
+            return resume_population(config, folder, overrides, [*config.trust, *named_modules(overrides), *trust])
     with reopened(folder, overrides, trust) as (trainer, config, modules):
         summary = trainer.train()
         show(trainer, summary, config, modules)
@@ -209,7 +213,7 @@ def reopened(
             if text.startswith("start="):
                 raise ConfigError(f"{text}: the run has begun already; start= is for new runs, without resume=")
             before, after = override(config, text)
-            if before != after:
+            if before != after and not text.startswith("trust="):  # which counts for this command alone
                 print(f"resume: {text.partition('=')[0]} was {before}, and is {after} from now on", flush=True)
         if config.get("grid") is not None:
             raise ConfigError(f"resume: expected a run that was trained, but {folder} holds the solution of a grid")
