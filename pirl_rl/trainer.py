@@ -324,6 +324,8 @@ class Trainer:
             return
         run = RunDirectory(self.folder)
         checkpoint.save(self.state_dict(), run.last)
+        for path in (run.summary, run.evaluation):
+            path.unlink(missing_ok=True)  # of a run that goes on: they are about earlier networks
         if keep_weights:
             weights = {"loss": self.learner.loss.state_dict(), "update": self.update}
             checkpoint.save(weights, run.weights(self.update))

@@ -200,3 +200,17 @@ def test_training_in_memory_is_not_checked_at_each_update_once_a_checkpoint_is_l
     for _ in range(3):
         trainer.keep(stop=False)
     assert checks == [7]
+
+
+def test_a_run_that_goes_on_has_no_summary_of_earlier_networks(tmp_path):
+    small_trainer(tmp_path, "trainer.updates=6").train()
+    run = RunDirectory(tmp_path)
+    run.evaluation.write_text("{}")
+    again = resumed(tmp_path, "trainer.updates=12")
+    at_update(again, 9, interrupt)
+    with pytest.raises(Interrupted):
+        again.train()
+    assert not run.summary.exists()
+    assert not run.evaluation.exists()
+    resumed(tmp_path, "trainer.updates=12").train()
+    assert run.numbers()["updates"] == 12
