@@ -87,6 +87,9 @@ def test_what_a_grid_cannot_do_is_said(run, folder, tmp_path, capsys):
     with pytest.raises(ConfigError, match="expected at most 3 states for a grid, got 4"):
         pirl_rl.train(CartPole, method="grid", folder=tmp_path / "cartpole")
     assert not (tmp_path / "cartpole").exists()
+    with pytest.raises(ConfigError, match=r"evaluation\.final"):
+        pirl_rl.train("reach1d", method="grid", folder=tmp_path / "typo", **{"evaluation.final": ["succes"]})
+    assert not (tmp_path / "typo").exists()
     with pytest.raises(SystemExit):
         resume(folder, [])
     assert "holds the solution of a grid" in capsys.readouterr().err

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import shutil
 from dataclasses import asdict
 
 import pytest
@@ -142,6 +143,7 @@ def test_the_command_goes_on_where_it_stopped(tmp_path, capsys, monkeypatch):
     assert (tmp_path / "runs/suite/suite.png").is_file()
     capsys.readouterr()
     (tmp_path / "runs/suite/exit1d/4/checkpoints").mkdir(parents=True)  # a run that was killed early
+    shutil.copytree(tmp_path / "runs/suite/exit1d/3", tmp_path / "runs/suite/exit1d/3-backup")
     main([*SMALL, "seeds=[3,4]"])
     assert json.loads((tmp_path / "runs/suite/exit1d/3/score-50-20.json").read_text()) == first
     printed = capsys.readouterr().out

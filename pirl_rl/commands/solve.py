@@ -49,6 +49,7 @@ def solve(
     check_problem(problem)
     choose_time_steps(config, problem)
     choose_paths(config, problem, make_evaluation_simulator(config, problem))
+    evaluators = make_evaluators(config.evaluation, "final", trust)
     print(f"solving on a grid of {' x '.join(map(str, solver.points))} nodes across the box of states", flush=True)
     started = time.perf_counter()
     # Evaluators and figures take what has the methods of a solution.
@@ -59,7 +60,6 @@ def solve(
     save_config(config, folder)
     record_session(run, overrides, "cpu")
     solution.save(run.grid)
-    evaluators = make_evaluators(config.evaluation, "final", trust)
     evidence = evaluate(solution, make_evaluation_simulator(config, problem), evaluators)
     error = {"grid_error": solution.largest_error} if solver.estimate else {}
     summary = {"wall_seconds": seconds, "grid_nodes": float(np.prod(solution.mesh.shape)), **error}

@@ -37,8 +37,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from pirl_rl.assembly import make_problem
 from pirl_rl.commands.composition import compose
-from pirl_rl.commands.console import program, reported
-from pirl_rl.commands.train import refuse_other_settings, resume, train_new
+from pirl_rl.commands.console import named_modules, program, reported
+from pirl_rl.commands.train import go_on, refuse_other_settings, train_new
 from pirl_rl.configuration import load_config
 from pirl_rl.errors import ConfigError
 from pirl_rl.figures import draw_suite, save_figures
@@ -172,7 +172,8 @@ def _measured(folder: Path, options: dict[str, Any]) -> tuple[dict[str, list[Sco
             continue
         truth, _ = _read_truth(known)
         file = _score_file(truth, options["rollouts"])
-        seeds = sorted(int(run.name) for run in (folder / name).glob("[0-9]*") if (run / file).is_file())
+        runs = [run for run in (folder / name).iterdir() if run.name.isdecimal() and (run / file).is_file()]
+        seeds = sorted(int(run.name) for run in runs)
         paths = [folder / name / str(seed) / file for seed in seeds]
         if paths:
             scores[name] = [Score(**json.loads(path.read_text(encoding="utf-8"))) for path in paths]
@@ -194,16 +195,17 @@ def _score(folder: Path, name: str, overrides: Sequence[str], truth: Truth, roll
         return Score(**json.loads(path.read_text(encoding="utf-8")))
     if not run.summary.is_file():
         print(f"{name}: {' '.join(overrides)}", flush=True)
-        if run.last.is_file():
-            resume(folder, [])
-        else:
-            # A run that was killed before its first checkpoint has nothing to go on from.
-            shutil.rmtree(folder, ignore_errors=True)
-            train_new(compose("train", typed), folder, typed)
+        with reported(folder):
+            if run.config.is_file():
+                go_on(folder, [], [*load_config(folder).trust, *named_modules(typed)])
+            else:
+                # A run that was killed before it had a configuration has nothing to go on from.
+                shutil.rmtree(folder, ignore_errors=True)
+                train_new(compose("train", typed), folder, typed)
     summary = json.loads(run.summary.read_text(encoding="utf-8"))
     trained = load_run(folder, trust=load_config(folder).trust)
     score = measure(
-        trained.solution, trained.simulator, truth, rollouts, summary["wall_seconds"], int(summary["updates"])
+        trained.solution, trained.simulator, truth, rollouts, summary["wall_seconds"], int(summary.get("updates", 0))
     )
     with replacing(path) as file:
         file.write(json.dumps(asdict(score), indent=2) + "\n")
