@@ -6,11 +6,13 @@ import csv
 import netrc
 import os
 from collections.abc import Iterable, Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
 
+from pirl_rl.errors import ArgumentError
 from pirl_rl.files import replacing
 from pirl_rl.run_directory import RunDirectory
 
@@ -81,9 +83,14 @@ class TorchRLLogger(CSVLogger):
         kind: "tensorboard", or "wandb" for Weights & Biases. Without WANDB_MODE, WANDB_API_KEY and an account in the
             netrc file, W&B runs offline.
         project: name of the W&B project.
+
+    Raises:
+        ArgumentError: tensorboard is not installed.
     """
 
     def __init__(self, kind: Literal["wandb", "tensorboard"], project: str = "pirl_rl"):
+        if kind == "tensorboard" and find_spec("tensorboard") is None:
+            raise ArgumentError("logger: tensorboard is not installed: pip install 'pirl_rl[tensorboard]'")
         self.kind: Literal["wandb", "tensorboard"] = kind
         self.project = project
 
@@ -97,7 +104,9 @@ class TorchRLLogger(CSVLogger):
             name = folder.name
             os.environ.setdefault("WANDB_CACHE_DIR", str(folder / "wandb" / "cache"))
             offline = "WANDB_MODE" not in os.environ and not _has_wandb_account()
-            extra = {"wandb_kwargs": {"project": self.project, "offline": offline, "config": dict(config)}}
+            # The members of a population are open at once, each as a run of its own.
+            options = {"project": self.project, "offline": offline, "config": dict(config), "reinit": "create_new"}
+            extra = {"wandb_kwargs": options}
         self.logger: Any = get_logger(self.kind, logger_name=str(folder), experiment_name=name, **extra)
 
     def log(self, row: Mapping[str, float]) -> None:

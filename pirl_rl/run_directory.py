@@ -188,10 +188,15 @@ class RunDirectory:
     def refuse_links(self) -> None:
         """Refuse a directory whose links would make this program write outside it.
 
+        Weights & Biases links its logs to those of its service, which may be elsewhere; nothing writes there.
+
         Raises:
             ConfigError: with the link that leads out of it.
         """
         root = self.path.resolve()
         for path in self.path.rglob("*"):
+            folders = path.relative_to(self.path).parts[:-1]
+            if folders[:1] == ("wandb",) and folders[-1] == "logs":
+                continue
             if path.is_symlink() and not path.resolve().is_relative_to(root):
                 raise ConfigError(f"{path}: expected no link that leads out of the run directory, to {path.resolve()}")

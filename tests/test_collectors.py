@@ -254,9 +254,11 @@ def test_silent_workers_are_noticed(tmp_path, monkeypatch):
     collector._collector = type("Silent", (), {"procs": [multiprocessing.current_process()]})()
     now = 100.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
-    collector._delivered_at = now
+    collector._looked_at = now
     collector.step(1)
-    now = 106.0
+    now = 1_000.0  # the machine slept, and with it the workers
+    collector.step(1)
+    now = 1_001.0
     with pytest.raises(CollectorError, match="delivered nothing for 5 s"):
         collector.step(1)
     collector._collector = None

@@ -49,3 +49,13 @@ def test_links_that_lead_out_are_refused(tmp_path):
     (run.figures / "outer").symlink_to(tmp_path)
     with pytest.raises(ConfigError, match=r"figures/outer: expected no link that leads out of the run directory"):
         run.refuse_links()
+
+
+def test_the_logs_of_a_logging_service_may_be_links(tmp_path):
+    logs = tmp_path / "run" / "wandb" / "offline-run-1" / "logs"
+    logs.mkdir(parents=True)
+    (logs / "debug-core.log").symlink_to(tmp_path / "cache" / "core.log")
+    RunDirectory(tmp_path / "run").refuse_links()
+    (tmp_path / "run" / "wandb" / "cache").symlink_to(tmp_path)
+    with pytest.raises(ConfigError, match="expected no link that leads out"):
+        RunDirectory(tmp_path / "run").refuse_links()

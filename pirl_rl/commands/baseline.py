@@ -51,7 +51,8 @@ def _in_force(path: Path, trainer: Trainer, trust: Sequence[str]) -> dict[str, A
     start has none, the initial values of the candidates' collocation are taken.
     """
     config = load_config(RunDirectory.of_checkpoint(path).path)
-    config.device, before = "cpu", make_trainer(config, None, trust)
+    config.device = "cpu"
+    before = make_trainer(config, None, trust)
     last = max(_update(checkpoint.load(path)) - 1, 0)
     settings: dict[str, Any] = {"weights": before.curriculum.weights(last)}
     if isinstance(trainer.batches.collocation, ReplayCollocation):

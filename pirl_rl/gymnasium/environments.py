@@ -10,9 +10,14 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
+
+try:
+    import gymnasium
+except ModuleNotFoundError as error:
+    hint = "pirl_rl.gymnasium needs gymnasium: pip install 'pirl_rl[baselines]'"
+    raise ModuleNotFoundError(hint, name="gymnasium") from error
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space

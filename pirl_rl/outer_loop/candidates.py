@@ -31,7 +31,10 @@ JUDGED = ("reward", "calibration_mae")
 TIMES = ("updates", "wall_seconds", "updates_per_second")
 """Entries of a summary that are not metrics; the times differ when the same candidate is trained again."""
 
-STOPPED = (INTERRUPTED, *(-number for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)))
+# Not every system has all of these signals.
+SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+
+STOPPED = (INTERRUPTED, *(-number for number in SIGNALS))
 """Exit codes of a candidate that was asked to stop and can be resumed."""
 
 LEADING = ("trainer.rollback=true",)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import time
 from collections.abc import Iterator
@@ -80,6 +79,10 @@ def locked(out: Path) -> Iterator[int]:
 
 
 def _lock(descriptor: int, out: Path) -> None:
+    try:
+        import fcntl
+    except ModuleNotFoundError:
+        raise ConfigError("tune: it locks its folder with fcntl, which Linux and macOS have") from None
     deadline = time.monotonic() + PATIENCE
     while True:
         try:
