@@ -246,6 +246,11 @@ class TwoTargets(DoubleIntegrator):
         return x.norm(dim=-1) - 0.1
 
 
+class UndefinedBranch(ZermeloBoat):
+    def avoid_level(self, x):
+        return torch.where(x[..., 0] > 0, 2 - x[..., 0].sqrt(), 2.0 - x[..., 0])
+
+
 class OnOff(DoubleIntegrator):
     def drift(self, x, u):
         return super().drift(x, u.sign())
@@ -299,6 +304,7 @@ FAULTS = [
     (Indicator, "warning", "target_level", "derivative is 0"),
     (DetachedLevel, "warning", "target_level", "derivative is 0"),
     (OnOff, "warning", "drift", "derivative is 0"),
+    (UndefinedBranch, "error", "avoid_level", "A branch of torch.where that is not taken"),
     (RandomNoise, "error", "diffusion", "random numbers"),
     (FarFromTheOrigin, "warning", "states", "along axis 0 .* apart in single precision"),
     (RandomDrift, "error", "drift", "random numbers"),

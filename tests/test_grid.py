@@ -687,3 +687,33 @@ def test_noise_two_integrators_away_agrees_with_monte_carlo_of_its_own_policy():
     # The problem is its own mirror image.
     left, right = x[:, 0] < -0.2, x[:, 0] > 0.2
     assert abs(distances[True][left].mean() - distances[True][right].mean()) < 0.07
+
+
+class Tank(ReachAvoidProblem):
+    """Torricelli's law: fill a leaking tank before it is empty. Below its bottom the drift has no value."""
+
+    horizon = 4.0
+    states, controls = Box([0.0], [2.0]), Box([0.0], [0.5])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return u - 0.3 * x.sqrt()
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.full_like(x, 0.02).unsqueeze(-1)
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return 1.5 - x[..., 0]
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        return x[..., 0]
+
+
+def test_a_drift_without_a_value_in_a_set_is_not_asked_there():
+    """From 1.2 m the tank fills at 0.14 m/s or more, and needs 2.3 s at most for 0.3 m; it is never filled in 0.5 s."""
+    solution = GridSolver(Tank(), 201).solve()
+    x = torch.linspace(0.02, 1.48, 60, dtype=torch.float64).unsqueeze(-1)
+    for tau in (0.5, 4.0):
+        value = solution.value(torch.full((60,), tau, dtype=torch.float64), x)
+        assert value.isfinite().all()
+        assert (value.diff() > -1e-3).all()
+        assert (value[x[:, 0] < 1.2] < 0.01).all() if tau == 0.5 else (value[x[:, 0] > 1.2] > 0.99).all()

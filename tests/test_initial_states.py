@@ -313,3 +313,19 @@ def test_networks_that_have_diverged_give_equal_weights():
 def test_copies_for_other_processes_draw_with_equal_weights():
     law = pickle.loads(pickle.dumps(UndecidedStates(UniformStates(), Known(), Simulator(Safety1D()))))
     assert torch.equal(draw(Safety1D(), law)[1], draw(Safety1D(), UniformStates())[1])
+
+
+def test_a_thin_interior_is_found():
+    """A ball takes 0.25 % of the cube with ten states, so that a thousand draws leave some of 2,000 states outside."""
+
+    class Ball(Safety1D):
+        states = Box([-1.0] * 10, [1.0] * 10)
+
+        def avoid_level(self, x):
+            return 1 - x.norm(dim=-1)
+
+    x = sample_interior(Ball(), Ball.states, 2_000, torch.Generator().manual_seed(0), torch.float32)
+    assert x.shape == (2_000, 10)
+    assert (x.norm(dim=-1) < 1).all()
+    # The radius is that of a uniform law in the ball: r^10 has the mean 1/2 and the standard deviation 1/12^0.5.
+    assert x.norm(dim=-1).double().pow(10).mean().item() == pytest.approx(0.5, abs=5 / (12 * 2_000) ** 0.5)

@@ -136,6 +136,13 @@ def derivatives(samples: Samples) -> Iterator[Finding]:
             yield found(
                 problem, "error", part, f"expected a function that torch can differentiate, got {slope}; {need}."
             )
+        elif part in LEVELS and not slope.isfinite().all():
+            bad = ~slope.isfinite().all(-1)
+            message = (
+                f"expected finite derivatives, got NaN or infinite ones at {_share(bad)} of the states. A branch of "
+                f"torch.where that is not taken is differentiated too, so give it valid arguments; {need}."
+            )
+            yield found(problem, "error", part, message, x[bad][0])
         elif varied > 0 and not (slope != 0).any():
             message = f"expected a slope, but its derivative is 0 at all {len(x)} states while its values vary; {need}."
             yield found(problem, "warning", part, message)

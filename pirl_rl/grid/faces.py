@@ -105,8 +105,10 @@ def _step(problem: ReachAvoidProblem, spacing: Tensor, policy: Function, tau: Te
     variance = (sigma / spacing.unsqueeze(-1)).square().sum(-1)
     rate = torch.maximum((drift / spacing).abs() / LENGTH, variance / LENGTH**2).amax(-1)
     h = torch.minimum(tau, 1 / rate.clamp(min=1e-12))
-    half = problem.states.wrap(x + drift * (h / 2).unsqueeze(-1))
-    moved = x + problem.drift(half, u) * h.unsqueeze(-1) + times(sigma, normal) * h.sqrt().unsqueeze(-1)
+    middle = problem.drift(problem.states.wrap(x + drift * (h / 2).unsqueeze(-1)), u)
+    # Inside a set the drift need not have a value.
+    middle = torch.where(middle.isfinite(), middle, drift)
+    moved = x + middle * h.unsqueeze(-1) + times(sigma, normal) * h.sqrt().unsqueeze(-1)
     moved, reached, failed = problem.states.wrap(moved), torch.zeros_like(h), torch.zeros_like(h)
     path, within = (x, moved, sigma, h), problem.states.within_period
     if problem.has_avoid_set:

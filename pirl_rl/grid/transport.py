@@ -179,8 +179,11 @@ def _flow(problem: ReachAvoidProblem, mesh: Mesh, x: torch.Tensor, u: torch.Tens
     looks = max(1, int(np.ceil(LOOKS * cells)))
     h, ended, end = dt / looks, np.zeros(len(x), bool), np.zeros(len(x))
     for _ in range(looks):
-        middle = wrap(x + problem.drift(x, u) * (h / 2))
-        x = wrap(x + problem.drift(middle, u) * h)
+        slope = problem.drift(x, u)
+        middle = problem.drift(wrap(x + slope * (h / 2)), u)
+        # Inside a set the drift need not have a value, as that of a tank below its bottom.
+        moved = wrap(x + torch.where(middle.isfinite(), middle, slope) * h)
+        x = torch.where(moved.isfinite(), moved, x)
         inside, value = absorbed(problem, x.numpy())
         end = np.where(inside & ~ended, value, end)
         ended = ended | inside

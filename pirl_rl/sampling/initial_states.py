@@ -194,13 +194,21 @@ def redrawn(problem: ReachAvoidProblem, count: int, draw: Callable[[int], Tensor
         draw: draws the given number of states; states inside A or B are drawn again.
 
     Raises:
-        ProblemError: states inside A or B remain after `ATTEMPTS` draws.
+        ProblemError: no state, or too few, are outside A and B after `ATTEMPTS` draws.
     """
     x = draw(count)
-    for _ in range(ATTEMPTS):
-        absorbed = ~problem.interior(x)
-        missing = int(absorbed.sum())
+    for attempt in range(2 * ATTEMPTS):
+        absorbed = (~problem.interior(x)).nonzero().squeeze(-1)
+        missing = len(absorbed)
         if missing == 0:
             return x
-        x[absorbed] = draw(missing)
+        if attempt < ATTEMPTS:
+            x[absorbed] = draw(missing)
+            continue
+        if missing == count:
+            break
+        # Where hardly any state is outside both sets, the last ones are found among many candidates.
+        others = draw(count)
+        others = others[problem.interior(others)][:missing]
+        x[absorbed[: len(others)]] = others
     raise ProblemError(f"{type(problem).__name__}: no initial state outside the target and the avoid set found")
