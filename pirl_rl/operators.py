@@ -42,8 +42,8 @@ from pirl_rl.sigma import times
 
 ValueFunction = Callable[[Tensor, Tensor], Tensor]
 
-BITS = 8
-"""The number of random signs in a random byte."""
+BITS = 62
+"""The number of random signs in a random integer."""
 
 
 def _tanh(z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -113,11 +113,13 @@ def rademacher(count: int, x: Tensor, channels: int) -> Tensor:
 
     Among all laws of independent entries they give the trace the smallest variance; for one channel it is exact.
     """
-    # The bits of random bytes take a tenth of the time of as many random numbers.
-    kind = {"dtype": torch.uint8, "device": x.device}
-    sample = torch.randint(2**BITS, (count, len(x), -(-channels // BITS)), **kind)
-    bits = (sample.unsqueeze(-1) >> torch.arange(BITS, **kind)) & 1
-    return bits.flatten(-2)[..., :channels].to(x.dtype).mul_(2).sub_(1)
+    # The bits of random integers take a tenth of the time of as many random numbers.
+    widths = [min(BITS, channels - first) for first in range(0, channels, BITS)]
+    bits = [
+        torch.randint(2**BITS, (count, len(x), 1), device=x.device) >> torch.arange(width, device=x.device) & 1
+        for width in widths
+    ]
+    return torch.cat(bits, -1).to(x.dtype).mul_(2).sub_(1)
 
 
 def _along(value: ValueFunction, tau: Tensor, x: Tensor, f: Tensor, columns: Tensor) -> Tensor:

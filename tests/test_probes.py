@@ -102,7 +102,7 @@ def test_probes_are_independent_signs():
 
 
 def test_probes_of_many_channels_are_independent_signs_too():
-    """They come from several random bytes each; of 5,000 correlations none is above six standard errors, 6/50."""
+    """They come from two random integers each; of 5,000 correlations none is above six standard errors, 6/50."""
     torch.manual_seed(0)
     flat = rademacher(1, torch.zeros(2_500, 3), 100)[0]
     assert (flat.abs() == 1).all()
