@@ -12,6 +12,7 @@ import torch
 from small import assert_same, small_trainer
 from tensordict import TensorDict
 
+from pirl_rl.collectors.silence import Silence
 from pirl_rl.collectors.transitions import TRANSITION, Exploration, Transitions
 from pirl_rl.continuation import restore
 from pirl_rl.errors import CollectorError
@@ -254,7 +255,7 @@ def test_silent_workers_are_noticed(tmp_path, monkeypatch):
     collector._collector = type("Silent", (), {"procs": [multiprocessing.current_process()]})()
     now = 100.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
-    collector._looked_at = now
+    collector._silence = Silence()
     collector.step(1)
     now = 1_000.0  # the machine slept, and with it the workers
     collector.step(1)

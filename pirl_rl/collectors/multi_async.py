@@ -18,7 +18,7 @@ from torchrl import collectors as torchrl_collectors
 from torchrl.weight_update import SharedMemWeightSyncScheme
 
 from pirl_rl.collectors.buffers import buffer_state, check_sizes, fill_buffer, load_buffer, make_buffer
-from pirl_rl.collectors.ray import LONGEST_GAP
+from pirl_rl.collectors.silence import Silence
 from pirl_rl.collectors.transitions import ControlVariate, Exploration, PlayedPolicy, Transitions
 from pirl_rl.envs import ReachAvoidEnv
 from pirl_rl.errors import ArgumentError, CollectorError
@@ -77,7 +77,7 @@ class MultiAsyncCollector:
         self._write_lock = write_lock(self.buffer)
         storage: Any = self.buffer.storage
         weakref.finalize(self, shutil.rmtree, storage.scratch_dir, ignore_errors=True)
-        self._delivered, self._looked_at, self._silence = 0, 0.0, 0.0
+        self._delivered, self._silence = 0, Silence()
 
     @property
     def initial_states(self) -> InitialStates:
@@ -141,7 +141,7 @@ class MultiAsyncCollector:
         lock_writes_with(self.buffer, _WatchedLock(self._write_lock, self._check_workers))
         self._collector.set_seed(first)
         self._collector.start()
-        self._looked_at, self._silence = time.monotonic(), 0.0
+        self._silence = Silence()
         while len(self.buffer) < min(self.warmup_frames, self.buffer.storage.max_size):
             self._check_workers()
             time.sleep(0.02)
@@ -175,11 +175,8 @@ class MultiAsyncCollector:
         for index, process in enumerate(processes):
             if not process.is_alive():
                 raise CollectorError(f"rollout worker {index} of {len(processes)} died, exit code {process.exitcode}")
-        now, delivered = time.monotonic(), self.buffer.write_count
-        passed = min(now - self._looked_at, LONGEST_GAP)
-        self._silence = self._silence + passed if delivered == self._delivered else 0.0
-        self._delivered, self._looked_at = delivered, now
-        if self._silence > self.patience:
+        before, self._delivered = self._delivered, self.buffer.write_count
+        if self._silence.after(self._delivered != before) > self.patience:
             raise CollectorError(f"{len(processes)} rollout workers delivered nothing for {self.patience:.0f} s")
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from pirl_rl.cluster import check_address, connected, reason_of, require_ray
 from pirl_rl.collectors.buffers import buffer_state, check_sizes, fill_buffer, load_buffer, make_buffer
 from pirl_rl.collectors.player import Player
+from pirl_rl.collectors.silence import Silence
 from pirl_rl.collectors.transitions import ControlVariate, Exploration, PlayedPolicy, Transitions
 from pirl_rl.envs import ReachAvoidEnv
 from pirl_rl.errors import ArgumentError, CollectorError
@@ -28,10 +29,6 @@ MOST_DEATHS = 3
 
 POLL = 0.02
 """Seconds between two looks at the workers while the learner waits for the warm-up."""
-
-LONGEST_GAP = 5.0
-"""The most seconds between two looks that count as silence of the workers. In a longer gap the learner was busy, as
-with an evaluation, or its machine slept, and it could not hear the workers."""
 
 
 class RayCollector:
@@ -100,7 +97,7 @@ class RayCollector:
         self._playing: dict[Any, tuple[int, int]] = {}
         self._weights: Any = None
         self._sent, self._newest = 0, 0  # the numbers of the networks that were sent last, and played last
-        self._deaths, self._silence, self._looked_at = 0, 0.0, 0.0
+        self._deaths, self._silence = 0, Silence()
 
     @property
     def initial_states(self) -> InitialStates:
@@ -136,7 +133,7 @@ class RayCollector:
     def start(self) -> None:
         self._ray = self._held.enter_context(connected(self._address, self._workers))
         self._publish()
-        self._silence, self._looked_at = 0.0, time.monotonic()
+        self._silence = Silence()
         self._processes = [self._new_process(index) for index in range(self._workers)]
         for index in range(self._workers):
             self._send(index)
@@ -218,10 +215,7 @@ class RayCollector:
                 self.buffer.extend(transitions.to(self._rng.device))
                 self._deaths, self._newest = 0, max(self._newest, networks)
             self._send(index)
-        now = time.monotonic()
-        self._silence = 0.0 if done else self._silence + min(now - self._looked_at, LONGEST_GAP)
-        self._looked_at = now
-        if self._silence > self.patience:
+        if self._silence.after(bool(done)) > self.patience:
             free = self._ray.available_resources().get("CPU", 0)
             raise CollectorError(
                 f"{self._workers} rollout workers delivered nothing for {self.patience:.0f} s; each needs a processor "

@@ -62,7 +62,7 @@ class Proof(ABC):
 
     METHOD: ClassVar[str] = "affine arithmetic and Taylor models on the HJB inequality, branch and bound"
     TRIVIAL: ClassVar[int]
-    REPEATED: ClassVar[str] = ""
+    COMMAND: ClassVar[str] = "method=interval"
 
     @abstractmethod
     def bound(self, tau: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -145,10 +145,10 @@ class Proof(ABC):
             )
         except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
             raise ProofError(f"{path}: expected a file of `certify method=interval`, got {error}") from None
-        if not _are_equal(physics, problem):
+        if not _is_about(physics, problem):
             raise ProofError(
                 f"{path}: it proves something about a problem with other drift, noise, sets, controls or horizon than "
-                f"{type(problem).__name__}; prove again with method=interval{cls.REPEATED}"
+                f"{type(problem).__name__}; prove again with {cls.COMMAND}"
             )
         fields = {"problem": problem, "spline": spline, "margin": margin, "resisted": {}}
         return fields | {"boxes": int(boxes), "seconds": seconds}, subjects
@@ -201,7 +201,7 @@ class LowerBound(Proof):
         if str(found) != networks:
             raise ProofError(
                 f"{path}: it proves something about networks with SHA-256 {str(found)[:12]}, and those of this run "
-                f"have {networks[:12]}; prove again with method=interval"
+                f"have {networks[:12]}; prove again with {cls.COMMAND}"
             )
         return cls(networks=networks, **fields)
 
@@ -214,7 +214,7 @@ class UpperBound(Proof):
     """
 
     TRIVIAL = 1
-    REPEATED = " bounds=[upper]"
+    COMMAND = "method=interval bounds=[upper]"
 
     def bound(self, tau: np.ndarray, x: np.ndarray) -> np.ndarray:
         return 1 - self._least(tau, x)
@@ -255,12 +255,12 @@ def physics_of(problem: ReachAvoidProblem) -> np.ndarray:
     return np.concatenate(_physics(problem))
 
 
-def _are_equal(found: np.ndarray, problem: ReachAvoidProblem) -> bool:
-    """Whether numbers (k,) are `physics_of` a problem, up to rounding at the size of each function."""
+def _is_about(physics: np.ndarray, problem: ReachAvoidProblem) -> bool:
+    """Whether numbers (k,) are `physics_of` a problem, up to rounding beside the largest value of each function."""
     parts = _physics(problem)
     size = np.concatenate([np.full(len(part), np.abs(part).max(initial=0.0)) for part in parts])
-    physics = np.concatenate(parts)
-    return found.shape == physics.shape and bool((np.abs(found - physics) <= SAME * size).all())
+    own = np.concatenate(parts)
+    return physics.shape == own.shape and bool((np.abs(physics - own) <= SAME * size).all())
 
 
 def _physics(problem: ReachAvoidProblem) -> list[np.ndarray]:

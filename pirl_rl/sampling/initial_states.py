@@ -194,7 +194,7 @@ def redrawn(problem: ReachAvoidProblem, count: int, draw: Callable[[int], Tensor
         draw: draws the given number of states; states inside A or B are drawn again.
 
     Raises:
-        ProblemError: no state, or too few, are outside A and B after `ATTEMPTS` draws.
+        ProblemError: fewer states than asked for are found, if any.
     """
     x = draw(count)
     for attempt in range(2 * ATTEMPTS):
