@@ -20,6 +20,7 @@ from small import QUICK, at_each_update, at_update, command, small_trainer, wait
 from tensordict import TensorDict
 
 from pirl_rl import cluster, train
+from pirl_rl.collectors.silence import Silence
 from pirl_rl.errors import ArgumentError, ClusterError, CollectorError
 from pirl_rl.machine import read_sessions
 from pirl_rl.run_directory import RunDirectory
@@ -145,7 +146,8 @@ def test_silent_workers_are_noticed_and_a_sleep_of_the_machine_is_no_silence(tmp
     settings = ("collector=ray", "collector.patience=60", "collector.updates_per_batch=1000")
     collector = small_trainer(tmp_path, *settings, base=(*QUICK, *SMALL)).collector
     collector._ray, collector.warmup_frames, collector._sent, now = Silent(), 0, 1, [0.0]
-    monkeypatch.setattr("pirl_rl.collectors.ray.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("pirl_rl.collectors.silence.time.monotonic", lambda: now[0])
+    collector._silence = Silence()  # on this clock
     for pause in (1.0, 3_600.0, 50.0, 50.0):
         now[0] += pause
         collector.step(1)
