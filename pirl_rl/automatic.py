@@ -58,20 +58,21 @@ def choose_time_steps(config: DictConfig, problem: ReachAvoidProblem) -> None:
     """Replace `auto` in env.dt and env.substeps by numbers, and print the choice with its reason.
 
     Raises:
-        ConfigError: one of the two is neither `auto` nor a number, or out of range.
+        ConfigError: one of the two is neither `auto` nor a number, or out of range; or env.crossing is unknown.
         ProblemError: the problem contradicts itself.
     """
     kinds = {"dt": float, "substeps": int}
     values = {name: config.env[name] for name in kinds if name in config.env}
     given = {name: convert(value, kinds[name], f"env.{name}") for name, value in values.items() if value != AUTO}
+    crossing = config.env.get("crossing", Simulator.crossing)
     check_problem(problem)
     try:
-        check_time_steps(problem, given.get("dt"), given.get("substeps"))
+        check_time_steps(problem, given.get("dt"), given.get("substeps"), crossing)
     except ArgumentError as error:
         raise ConfigError(f"env.{error}") from None
     if AUTO not in values.values():
         return
-    chosen = propose_time_steps(problem, **given)
+    chosen = propose_time_steps(problem, **given, crossing=crossing)
     config.env.dt, config.env.substeps = chosen.dt, chosen.substeps
     print(f"time: {chosen.reason}", flush=True)
 

@@ -1,14 +1,18 @@
 """Simulation of the SDE, Eq. (sde), over one control step, with exits into A and B.
 
-A control is held for dt. The SDE is integrated by the Euler-Maruyama scheme with sub-steps of length h = dt / substeps.
-How an exit within a sub-step is detected is the rule `crossing`:
+A control is held for dt. The SDE is integrated with sub-steps of length h = dt / substeps:
 
-- "endpoint": an exit is detected only at the end of a sub-step.
-- "bridge": between the ends of a sub-step the path is a Brownian bridge, which may cross faces, see
-  `pirl_rl.crossings`.
+    x + f h + sigma(x, u) sqrt(h) xi,   xi normal.                                        Eq. (sub_step)
 
-A path that both reaches A and enters B within one sub-step counts as a failure. Periodic coordinates are brought back
-into their period at the end of each sub-step, before levels are taken there.
+The rule `crossing` names the drift f of a sub-step, and how an exit within it is detected:
+
+- "endpoint": f = f(x, u) at its start, the Euler-Maruyama scheme, and an exit is detected only at its end.
+- "bridge": f = f(x + f(x, u) h/2, u) at its middle, which gives no energy to oscillations, and between its ends the
+  path is a Brownian bridge, which may cross faces, see `pirl_rl.crossings`.
+
+A path that both reaches A and enters B within one sub-step counts as a failure. So does a path that leaves for infinity,
+because its drift grows too fast. Periodic coordinates are brought back into their period at the end of each sub-step,
+before levels are taken there.
 """
 
 from __future__ import annotations
@@ -37,6 +41,9 @@ the k faces of A, normal (R, 2, N, k) if there are at least two faces, and unifo
 ATTEMPTS = 2
 """How often a path may cross the last face of a target with corners in a sub-step, see `enters_intersection`."""
 
+LOST = 1e4
+"""The distance from the center of the box of states, in half widths, beyond which a path never comes back."""
+
 
 class Step(NamedTuple):
     """The outcome of a control step.
@@ -45,8 +52,8 @@ class Step(NamedTuple):
         state: states after the step (N, n); a path that ended keeps the state of the sub-step in which it ended.
         reached: paths that reached A (N,) bool.
         failed: paths that entered B (N,) bool; none of them counts as reached.
-        noise: the sum of sigma dW over the sub-steps (N, n), in the units of the state. It includes sub-steps after an
-            exit, so that its mean given the state before the step is zero.
+        noise: the sum of sigma dW over the sub-steps (N, n) until the path ended, in the units of the state. Its mean
+            given the state before the step is zero, because it stops at a stopping time.
     """
 
     state: Tensor
@@ -73,7 +80,7 @@ class Simulator:
         problem: the physics.
         dt: the length of a control step, in s.
         substeps: the number of integration steps in a control step.
-        crossing: "bridge" or "endpoint", how exits within a sub-step are detected.
+        crossing: "bridge" or "endpoint", the rule for the drift of a sub-step and for exits within it.
         compile: whether a sub-step is compiled, for one fixed number N of paths; the random numbers stay the same. None
             leaves the choice to functions that know how many steps they play.
 
@@ -162,8 +169,9 @@ class Simulator:
             rng: the random generator of the noise and of the crossings.
             dt: the length of the step for each path (N,), in s; default `self.dt` for all.
         """
-        # Each coordinate is made contiguous in memory, because problems unbind states into coordinates.
-        x = x.mT.contiguous().mT
+        # Each coordinate is made contiguous in memory, because problems unbind states into coordinates. It is always a
+        # copy, since the compiler cannot differentiate along a part of a larger tensor.
+        x = x.mT.clone(memory_format=torch.contiguous_format).mT
         h = (x.new_tensor(self.dt) if dt is None else dt) / self.substeps
         reached = torch.zeros(x.shape[:-1], dtype=torch.bool, device=x.device)
         failed, noise = reached, x
@@ -173,9 +181,8 @@ class Simulator:
             if index == 0:
                 x, reached, failed, noise = moved, now_reached & ~now_failed, now_failed, kick
                 continue
-            noise = noise + kick
             active = ~(reached | failed)
-            x = torch.where(active.unsqueeze(-1), moved, x)
+            x, noise = (torch.where(active.unsqueeze(-1), *pair) for pair in ((moved, x), (noise + kick, noise)))
             failed = failed | (active & now_failed)
             reached = reached | (active & now_reached & ~now_failed)
         return Step(x, reached, failed, noise)
@@ -190,8 +197,17 @@ class Simulator:
         """
         h = self.dt / self.substeps if dt is None else (dt / self.substeps).to(x)[..., None]
         for _ in range(self.substeps):
-            x = self.problem.states.wrap(x + self.problem.drift(x, u) * h)
+            x = self.problem.states.wrap(x + self._drift(x, u, h) * h)
         return x
+
+    def _drift(self, x: Tensor, u: Tensor, h: Tensor | float) -> Tensor:
+        """The drift f (N, n) of Eq. (sub_step) with a length h that broadcasts with (N, n)."""
+        drift = self.problem.drift(x, u)
+        if self.crossing == "endpoint":
+            return drift
+        middle = self.problem.drift(self.problem.states.wrap(x + drift * (h / 2)), u)
+        # The middle may lie where the physics is undefined, below the bottom of a tank for example.
+        return torch.where(middle.isfinite(), middle, drift)
 
     def _draw(self, x: Tensor, rng: torch.Generator | None) -> Draws:
         """The random numbers of a sub-step.
@@ -231,8 +247,10 @@ class Simulator:
         """One sub-step: states (N, n), sigma dW (N, n), and whether paths are in A and in B or crossed a face."""
         problem, sigma = self.problem, self.sigma(x, u, constant)
         kick = times(sigma, (noise * h.sqrt()).mT)
-        moved = problem.states.wrap(x + problem.drift(x, u) * h[..., None] + kick)
-        reached, failed = problem.reached(moved), problem.failed(moved)
+        moved = problem.states.wrap(x + self._drift(x, u, h[..., None]) * h[..., None] + kick)
+        lost = ~(problem.states.normalize(moved).abs() <= LOST).all(-1)
+        moved, kick = (torch.where(lost.unsqueeze(-1), *pair) for pair in ((x, moved), (torch.zeros_like(kick), kick)))
+        reached, failed = problem.reached(moved), problem.failed(moved) | lost
         path, within = (x, moved, sigma, h), problem.states.within_period
         if target is not None:
             reached = reached | enters_intersection(within(problem.reached_constraints), *path, target, corners)

@@ -8,7 +8,7 @@ control step without noise is that of ten times as many.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -58,6 +58,7 @@ def propose_time_steps(
     substeps: int | None = None,
     samples: int = 1024,
     seed: int = 0,
+    crossing: Literal["bridge", "endpoint"] = "bridge",
 ) -> TimeSteps:
     """Choose the control step, which then divides the horizon, and the integration steps of a problem.
 
@@ -67,18 +68,19 @@ def propose_time_steps(
         substeps: a number of sub-steps that is given, so that the control step alone is chosen.
         samples: the number of states in the box, and of controls, half of them vertices, at which rates are measured.
         seed: of the samples.
+        crossing: the rule of the simulator, which names the drift of an integration step.
 
     Raises:
-        ArgumentError: `dt`, `substeps` or `samples` is out of range.
+        ArgumentError: `dt`, `substeps` or `samples` is out of range, or `crossing` is unknown.
     """
     if samples < 1:
         raise ArgumentError(f"samples: expected at least 1, got {samples}")
-    check_time_steps(problem, dt, substeps)
+    check_time_steps(problem, dt, substeps, crossing)
     x, u = _samples(problem, samples, seed)
     moves, rate = [across_box(problem, x, u), *across_sets(problem, x, u)], fastest_rate(problem, x, u)
     chosen, limit = _control_step(problem.horizon, moves) if dt is None else (dt, "")
-    count = _substeps(problem, chosen, rate, x, u) if substeps is None else substeps
-    error = _error(problem, chosen, count, x, u)
+    count = _substeps(problem, chosen, crossing, rate, x, u) if substeps is None else substeps
+    error = _error(problem, chosen, count, crossing, x, u)
     plural = "s" if count > 1 else ""
     sentences = (
         f"Control step {chosen:.4g} s, {problem.horizon / chosen:.4g} in the horizon, with {count} integration "
@@ -90,13 +92,15 @@ def propose_time_steps(
     return TimeSteps(chosen, count, moves, error, " ".join(filter(None, sentences)))
 
 
-def check_time_steps(problem: ReachAvoidProblem, dt: float | None, substeps: int | None) -> None:
+def check_time_steps(
+    problem: ReachAvoidProblem, dt: float | None, substeps: int | None, crossing: str = "bridge"
+) -> None:
     """Refuse time steps that are out of range; None is a step that is still to be chosen.
 
     Raises:
-        ArgumentError: `dt` is not in (0, horizon], or `substeps` is below 1.
+        ArgumentError: `dt` is not in (0, horizon], `substeps` is below 1, or `crossing` is unknown.
     """
-    Simulator(problem, problem.horizon if dt is None else dt, 1 if substeps is None else substeps)
+    Simulator(problem, problem.horizon if dt is None else dt, 1 if substeps is None else substeps, crossing)
 
 
 def _samples(problem: ReachAvoidProblem, count: int, seed: int) -> tuple[Tensor, Tensor]:
@@ -131,19 +135,19 @@ def _control_step(horizon: float, moves: list[Move]) -> tuple[float, str]:
     return horizon / steps, limit
 
 
-def _substeps(problem: ReachAvoidProblem, dt: float, rate: float, x: Tensor, u: Tensor) -> int:
+def _substeps(problem: ReachAvoidProblem, dt: float, crossing: str, rate: float, x: Tensor, u: Tensor) -> int:
     """The smallest power of two that resolves the fastest rate and whose error is accepted."""
     count = LEAST_SUBSTEPS
     while count < min(dt * rate, MOST_SUBSTEPS):
         count *= 2
-    while count < MOST_SUBSTEPS and not _error(problem, dt, count, x, u) <= TOLERANCE:
+    while count < MOST_SUBSTEPS and not _error(problem, dt, count, crossing, x, u) <= TOLERANCE:
         count *= 2
     return count
 
 
-def _error(problem: ReachAvoidProblem, dt: float, substeps: int, x: Tensor, u: Tensor) -> float:
+def _error(problem: ReachAvoidProblem, dt: float, substeps: int, crossing: str, x: Tensor, u: Tensor) -> float:
     """How far ten times as many sub-steps change a control step without noise, in widths of the box."""
-    coarse, fine = (Simulator(problem, dt, count).flow(x, u) for count in (substeps, 10 * substeps))
+    coarse, fine = (Simulator(problem, dt, count, crossing).flow(x, u) for count in (substeps, 10 * substeps))
     gap = (coarse - fine).abs() / (2 * problem.states.center_and_half_width(x)[1])
     errors = gap.amax(-1).nan_to_num(torch.inf).sort().values
     return errors[int(COVERED * (len(errors) - 1))].item()

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from pirl_rl.networks import Critic
 from pirl_rl.operators import generator
+from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems import Reach1D, Safety1D, ZermeloBoat
 from pirl_rl.sampling.initial_states import sample_interior
 from pirl_rl.sets import Box
@@ -215,6 +216,97 @@ def test_one_step_mean_is_the_generator_to_first_order(problem):
     assert (fine <= coarse / 4 * 1.5 + coarse_sampling / 2 + fine_sampling + 1e-3 * exact.abs().max()).all()
 
 
+class Pendulum(ReachAvoidProblem):
+    """A free oscillation of 1 rad/s with little noise; reach a speed or an angle that no path has."""
+
+    horizon = 20 * math.pi
+    states, controls = Box([-2.0, -2.0], [2.0, 2.0]), Box([-1.0], [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.stack([x[..., 1], -x[..., 0]], -1)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return x.new_tensor([[0.0], [1e-3]]).expand(*x.shape[:-1], 2, 1)
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return 100 - x.norm(dim=-1)
+
+
+@pytest.mark.parametrize(("crossing", "growth"), [("bridge", 0.0), ("endpoint", 1.0)])
+def test_an_oscillation_keeps_its_energy_in_midpoint_steps(crossing, growth):
+    """In 10 periods and 800 steps: Euler steps multiply the amplitude by exp(w^2 h T/2) to first order in h."""
+    problem, rng = Pendulum(), torch.Generator().manual_seed(0)
+    simulator = Simulator(problem, problem.horizon / 800, 1, crossing)
+    x = torch.tensor([[1.0, 0.0]], dtype=torch.float64).repeat(500, 1)
+    for _ in range(800):
+        x = simulator.step(x, torch.zeros_like(x[:, :1]), rng).state
+    logarithm = x.norm(dim=-1).log().mean().item()
+    # Second-order steps multiply it by exp(w^4 h^3 T/8), and noise of the variance 1e-6 T adds less than 1e-4.
+    assert logarithm == pytest.approx(growth * problem.horizon**2 / 800 / 2, rel=0.1, abs=5e-3)
+
+
+class Explosion(Reach1D):
+    """dx = x^3 dt leaves for infinity within 1/(2 x^2): 0.02 s from -5, and 1/8 s from -2."""
+
+    states = Box([-2.0], [2.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return x**3
+
+
+class Survival(Explosion):
+    objective = "invariance"
+
+
+@pytest.mark.parametrize("crossing", ["bridge", "endpoint"])
+@pytest.mark.parametrize("problem", [Explosion(), Survival()], ids=name)
+def test_a_path_that_leaves_for_infinity_fails(problem, crossing):
+    x = torch.tensor([[-5.0], [-1e30], [0.0]])
+    step = Simulator(problem, 0.2, 20, crossing).step(x, torch.zeros_like(x), torch.Generator().manual_seed(0))
+    assert step.failed.tolist() == [True, True, False]
+    assert not step.reached.any()
+    assert step.state.isfinite().all()
+    assert step.noise.isfinite().all()
+
+
+class Undefined(Reach1D):
+    """Reach x <= 0; neither drift nor noise has a value there."""
+
+    states = Box([0.0], [2.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return -x.sqrt()
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return 0.1 * x.sqrt().unsqueeze(-1)
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return x[..., 0]
+
+
+def test_physics_without_a_value_in_the_target_is_not_asked_there():
+    """x^1/2 falls at 1/2 per s, so that 1e-3 is empty after 0.063 s; the middle of the step lies below 0."""
+    x = torch.full((1000, 1), 1e-3)
+    step = Simulator(Undefined(), 0.4, 2).step(x, torch.zeros_like(x), torch.Generator().manual_seed(0))
+    assert step.reached.all()
+    assert step.state.isfinite().all()
+    assert step.noise.isfinite().all()
+
+
+@pytest.mark.parametrize("crossing", ["bridge", "endpoint"])
+def test_the_noise_of_a_step_is_that_of_the_path_until_it_ended(crossing):
+    """Without drift, a path has moved by its noise alone."""
+
+    class Walk(Reach1D):
+        def drift(self, x: Tensor, u: Tensor) -> Tensor:
+            return torch.zeros_like(x)
+
+    x = torch.full((1000, 1), 1.8, dtype=torch.float64)
+    step = Simulator(Walk(), 0.5, 10, crossing).step(x, torch.zeros_like(x), torch.Generator().manual_seed(0))
+    assert 100 < step.reached.sum() < 900
+    torch.testing.assert_close(step.noise, step.state - x)
+
+
 def test_steps_of_own_length():
     problem, rng = Reach1D(), torch.Generator().manual_seed(0)
     x = torch.full((100_000, 1), -1.0, dtype=torch.float64)
@@ -262,6 +354,16 @@ def test_a_face_without_noise_is_not_crossed_between_the_ends():
 def test_wrong_steps_are_named(kwargs, message):
     with pytest.raises(ValueError, match=message):
         Simulator(Reach1D(), **kwargs)
+
+
+def test_a_part_of_a_larger_tensor_is_simulated_in_compiled_code(monkeypatch):
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="aot_eager"))
+    x = torch.linspace(-1, 1, 128)[:64].reshape(64, 1)
+    eager, compiled = (
+        Simulator(Reach1D(), 0.1, compile=compile).step(x, torch.zeros_like(x), torch.Generator().manual_seed(0))
+        for compile in (False, True)
+    )
+    torch.testing.assert_close(compiled, eager)
 
 
 @pytest.mark.parametrize("problem", [Reach1D(), ZermeloBoat()], ids=["one matrix of noise", "walls and a rock"])

@@ -118,7 +118,7 @@ def monte_carlo(
         dt: longest control step in s; the step of a state is tau / ceil(tau / dt), so that whole steps fill tau. The
             default is that of a training, see `pirl_rl.time_steps`.
         substeps: number of integration steps in a control step. The default is 1 with a given `dt`, else likewise.
-        crossing: how exits within a step are detected, see `pirl_rl.simulator`.
+        crossing: the rule for the drift of an integration step and for exits within it, see `pirl_rl.simulator`.
         seed: seed of the noise; torch's global random generator is not used.
         confidence: confidence level of the interval, which is approximate (Wilson 1927).
 
@@ -132,7 +132,7 @@ def monte_carlo(
     if not (isinstance(rollouts, int) and rollouts >= 1):
         raise ArgumentError(f"rollouts: expected an integer >= 1, got {rollouts!r}")
     if dt is None:
-        dt, substeps = propose_time_steps(problem, substeps=substeps)[:2]
+        dt, substeps = propose_time_steps(problem, substeps=substeps, crossing=crossing)[:2]
     simulator = Simulator(problem, dt, 1 if substeps is None else substeps, crossing)
     rng = seeded(seed, points.device)
     mean = mean_payoff(simulator, checked_policy(policy, problem), times, points, rollouts, rng)
