@@ -1,4 +1,4 @@
-"""Descent of level functions, which finds points of a set that is too thin to be hit by sampling."""
+"""Descent of level functions, which finds points of a set that is too thin to be hit by sampling, and its faces."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ STEPS = 400
 
 FIRST, LAST = 0.05, 1e-6
 """Sizes of the first and the last of these steps, in coordinates in which the box is [-1, 1]^n."""
+
+BISECTIONS = 50
+"""The number of halvings of a segment between a point inside a set and one outside; enough for double precision."""
 
 
 def descended(constraints: Callable[[Tensor], Tensor], x: Tensor, box: Box) -> Tensor:
@@ -40,3 +43,18 @@ def descended(constraints: Callable[[Tensor], Tensor], x: Tensor, box: Box) -> T
         with torch.no_grad():
             z.clamp_(-2, 2)
     return box.wrap(box.denormalize(z.detach()))
+
+
+def bisected(absorbs: Callable[[Tensor], Tensor], inside: Tensor, outside: Tensor) -> Tensor:
+    """The points (N, n) at which the segments from points inside a set to points outside leave it.
+
+    Args:
+        absorbs: whether states (N, n) are in the set, (N,) bool.
+        inside: states (N, n) in the set.
+        outside: states (N, n) that are not.
+    """
+    for _ in range(BISECTIONS):
+        middle = (inside + outside) / 2
+        held = absorbs(middle).unsqueeze(-1)
+        inside, outside = torch.where(held, middle, inside), torch.where(held, outside, middle)
+    return inside

@@ -2,8 +2,9 @@
 
 Across a length L the drift f moves a path by |f| t in a time t, and the noise by |sigma| sqrt(t). For a coordinate, L
 is the width of the box. For a constraint g of A or B, which is -D where the set is deepest, the drift gives
-|grad g . f| t, the noise |sigma^T grad g| sqrt(t), and L is D. All rates are medians over the samples: the corners of a
-box may have rates that no path meets.
+|grad g . f| t, the noise |sigma^T grad g| sqrt(t), and L is D. Where descent alone finds the set, they are taken half
+way between its face and its deepest points, where a smooth level has no slope. All rates are medians over the samples:
+the corners of a box may have rates that no path meets.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pirl_rl.descent import descended
+from pirl_rl.descent import bisected, descended
 from pirl_rl.problem import ReachAvoidProblem
 
 STARTS = 64
@@ -93,15 +94,24 @@ def _across(
     problem: ReachAvoidProblem, name: str, constraints: Callable[[Tensor], Tensor], x: Tensor, u: Tensor
 ) -> list[Move]:
     """The rates across each constraint of the set in which all of them hold, at points inside it."""
+
+    def holds(x: Tensor) -> Tensor:
+        return (constraints(x) <= 0).all(-1)
+
     lowest = x[constraints(x).amax(-1).argsort()[:STARTS]]
-    inside = torch.cat([x, descended(constraints, lowest, problem.states)])
-    inside = inside[(constraints(inside) <= 0).all(-1)]
-    if not len(inside):
+    deep = descended(constraints, lowest, problem.states)
+    found = torch.cat([x, deep])
+    found = found[holds(found)]
+    if not len(found):
         return []
+    depths = (-constraints(found)).amax(0).tolist()
+    entering = holds(deep) & ~holds(lowest)
+    face = bisected(holds, deep[entering], lowest[entering])
+    inside = torch.cat([x[holds(x)], (face + deep[entering]) / 2])
     u = u[torch.arange(len(inside)) % len(u)]
     f, sigma = problem.drift(inside, u), problem.diffusion(inside, u)
     speed = torch.func.jvp(constraints, (inside,), (f,))[1].abs().median(0).values
     columns = [torch.func.jvp(constraints, (inside,), (column,))[1] for column in sigma.unbind(-1)]
     spread = torch.stack(columns).norm(dim=0).median(0).values
-    rates = zip((-constraints(inside)).amax(0).tolist(), speed.tolist(), spread.tolist(), strict=True)
+    rates = zip(depths, speed.tolist(), spread.tolist(), strict=True)
     return [Move(name, v / depth, s / depth) for depth, v, s in rates if depth > 0]

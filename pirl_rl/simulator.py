@@ -10,9 +10,9 @@ The rule `crossing` names the drift f of a sub-step, and how an exit within it i
 - "bridge": f = f(x + f(x, u) h/2, u) at its middle, which gives no energy to oscillations, and between its ends the
   path is a Brownian bridge, which may cross faces, see `pirl_rl.crossings`.
 
-A path that both reaches A and enters B within one sub-step counts as a failure. So does a path that leaves for infinity,
-because its drift grows too fast. Periodic coordinates are brought back into their period at the end of each sub-step,
-before levels are taken there.
+A path that both reaches A and enters B within one sub-step counts as a failure. So does a path that leaves for
+infinity, because its drift grows too fast. Periodic coordinates are brought back into their period at the end of each
+sub-step, before levels are taken there.
 """
 
 from __future__ import annotations

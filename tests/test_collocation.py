@@ -8,9 +8,10 @@ from oracles import PROBLEMS, Corner, name
 from tensordict import TensorDict
 
 from pirl_rl.errors import ProblemError
-from pirl_rl.problems import Reach1D, Safety1D, VehicleDrift
+from pirl_rl.problems import HalfSpace, RadialExit, Reach1D, Safety1D, VehicleDrift
 from pirl_rl.sampling.boundary import BoundarySampler
 from pirl_rl.sampling.collocation import Collocation, ReplayCollocation
+from pirl_rl.sampling.faces import find_faces
 from pirl_rl.sets import Box
 
 SAMPLERS = pytest.mark.parametrize("sampler", ["uniform", "sobol"])
@@ -118,6 +119,34 @@ def test_every_face_of_a_square_is_found():
     x = BoundarySampler(Corner(), initial=0, faces=2_000).sample(make_rng())["state"]
     for level in ((x - 0.5).abs(), (x + 0.5).abs()):
         assert ((level < 1e-6).float().mean(0) > 0.1).all()
+
+
+class Coins(Reach1D):
+    """Two targets in one level, of which the smaller one has 1/900 of the area."""
+
+    states, controls = Box([-2.0, -2.0], [2.0, 2.0]), Box([-1.0, -1.0], [1.0, 1.0])
+
+    def drift(self, x, u):
+        return u
+
+    def diffusion(self, x, u):
+        return torch.eye(2, dtype=x.dtype).expand(*x.shape[:-1], 2, 2)
+
+    def target_level(self, x):
+        return torch.minimum((x - 1).norm(dim=-1) - 0.6, (x + 1).norm(dim=-1) - 0.02)
+
+
+def test_a_small_part_of_a_set_has_its_share_of_the_points():
+    """Half of the points are found by descent from states everywhere, and half of these end in the small target."""
+    x = find_faces(Coins(), make_rng()).points
+    assert 0.15 < ((x + 1).norm(dim=-1) < 0.03).float().mean() < 0.35
+
+
+@pytest.mark.parametrize("problem", [HalfSpace(dim=100), RadialExit(dim=100)], ids=name)
+def test_faces_among_a_hundred_states_are_beside_many_states_of_the_box(problem):
+    faces = find_faces(problem, make_rng())
+    kept = problem.states.contains(faces.points) & problem.states.contains(faces.outside)
+    assert len(faces.outside[kept].unique(dim=0)) > 1_000
 
 
 @problems

@@ -156,15 +156,18 @@ def test_visited_states_take_their_share():
 
 
 def test_the_distances_of_states_near_faces_are_log_uniform():
-    """A state is 10^-4U D from the face at 2, with D uniform in (0, 6): a decade below has a quarter of these states.
+    """A state is 10^-4U D from the face at 2: a decade below has a quarter of these states.
 
-    The mean of log10(D) is log10(6) - 1/log(10). The shares have a standard error of 0.003.
+    D is uniform in (0, 4) for the states of the box, and in (0, 6) for those of one twice as wide, of which a quarter
+    lie in the target. The mean of log10(D) for D uniform in (0, d) is log10(d) - 1/log(10). The shares have a standard
+    error of 0.003.
     """
     _, x = draw(Reach1D(), NearFaces(UniformStates(), 0.7, 4.0))
     distance = 2 - x[:, 0].double()
     assert Reach1D().interior(x).all()
     below = (distance < 4e-3).double().mean().item()
-    assert below == pytest.approx(0.7 * (1 - (math.log10(6 / 4e-3) - 1 / math.log(10)) / 4), abs=0.015)
+    farthest = (4 * math.log10(4) + 3 * math.log10(6)) / 7
+    assert below == pytest.approx(0.7 * (1 - (farthest - math.log10(4e-3) - 1 / math.log(10)) / 4), abs=0.015)
     decades = [((distance > edge) & (distance < 10 * edge)).double().mean().item() for edge in (1e-3, 1e-2)]
     assert decades == pytest.approx([0.7 / 4] * 2, abs=0.015)
 

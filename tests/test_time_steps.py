@@ -75,6 +75,13 @@ class Ball(Linear):
         return 100 * ((x - self.center).norm(dim=-1) - 0.02)
 
 
+class Bowl(Ball):
+    """The same ball as a level that has no slope at its deepest point."""
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return (x - self.center).square().sum(-1) - 0.02**2
+
+
 def sampled(problem, count: int = 2000):
     rng = torch.Generator().manual_seed(0)
     return problem.states.sample(count, rng, torch.float64), problem.controls.sample(count, rng, torch.float64)
@@ -115,10 +122,11 @@ def test_rates_across_sets_are_those_of_their_depths():
     assert [round(move.spread, 3) for move in across_sets(Safety1D(), *sampled(Safety1D()))] == [1.0, 1.0]
 
 
+@pytest.mark.parametrize("kind", [Ball, Bowl])
 @pytest.mark.parametrize("center", [0.0, 0.5, -0.7])
-def test_a_thin_target_is_found_by_descent(center):
-    """Its level is 2 at its center, and changes by 100 times the distance: 0.1 of noise move it by 5 depths in 1 s."""
-    problem = Ball(0.1, center)
+def test_a_thin_target_is_found_by_descent(center, kind):
+    """From the face to the center the level falls by its depth in 0.02: 0.1 of noise move it by 5 depths in 1 s."""
+    problem = kind(0.1, center)
     x, u = sampled(problem, 1000)
     assert not problem.reached(x).any()
     (move,) = across_sets(problem, x, u)

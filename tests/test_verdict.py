@@ -160,6 +160,12 @@ GOOD = Measures(
         ({"success": 0.0, "high": 0.0001, "random": 0.0, "constant": 0.0}, "failed", "nor does a random"),
         ({"success": 0.0, "high": 0.0001, "constant": 0.3}, "failed", "while another reaches 0.300"),
         ({"success": 0.0, "high": 0.0001, "invariance": True}, "failed", "never stays out of the avoid set"),
+        (
+            {"success": 2e-3, "high": 3e-3, "random": 1e-3, "constant": 0.0},
+            "doubtful",
+            "in 0.002 of the paths, and random",
+        ),
+        ({"success": 2e-3, "high": 3e-3, "constant": 0.3}, "failed", "hardly ever reaches the target, while another"),
         ({"value_spread": 0.001}, "failed", "V is the same at all states"),
         ({"value_spread": 0.001, "success_spread": 0.0}, None, ""),
     ],

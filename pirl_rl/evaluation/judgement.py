@@ -10,8 +10,8 @@ from typing import Literal, NamedTuple
 
 Level = Literal["solved", "doubtful", "failed"]
 
-NEVER = 0.005
-"""A mean success below this counts as never."""
+RARE = 0.005
+"""A mean success whose interval lies below this is rare."""
 
 GAP, LARGE_GAP = 0.03, 0.10
 """Mean errors of V, without the noise of Monte Carlo, above which a solution is doubtful, and above which it failed."""
@@ -21,6 +21,9 @@ BIAS = 0.02
 
 BETTER = 0.02
 """The mean success by which another policy, or another time step, must differ to matter."""
+
+LOOK_AT_SETS = "check the sets with python -m pirl_rl.check, and that the horizon suffices"
+"""The advice where no path succeeds, or hardly any."""
 
 ERRORS = 3.0
 """The number of standard errors by which a difference must exceed 0 to matter."""
@@ -119,15 +122,11 @@ def _failures(m: Measures):
     if not all(number == number for number in (m.success, m.gap, m.value_spread)):
         yield Reason("failed", "V or the policy is not a number.", "lower learner.learning_rate, and check the problem")
         return
-    if m.high < NEVER or m.success == 0:
-        event = "stays out of the avoid set" if m.invariance else "reaches the target"
-        others = max(m.random, m.constant)
-        also = "nor does a random or a constant control" if others < NEVER else f"while another reaches {others:.3f}"
-        yield Reason(
-            "failed",
-            f"The policy never {event}, {also}.",
-            "check the sets with python -m pirl_rl.check, and that the horizon suffices",
-        )
+    others = max(m.random, m.constant)
+    if m.success == 0 or (m.high < RARE and others >= RARE):
+        also = "nor does a random or a constant control" if others < RARE else f"while another reaches {others:.3f}"
+        how = "never" if m.success == 0 else "hardly ever"
+        yield Reason("failed", f"The policy {how} {_event(m)}, {also}.", LOOK_AT_SETS)
     if m.over_constant.mean > 0 and m.over_constant.matters():
         control = _numbers(m.constant_control)
         yield Reason(
@@ -150,6 +149,9 @@ def _failures(m: Measures):
 
 
 def _doubts(m: Measures):
+    if m.success > 0 and max(m.high, m.random, m.constant) < RARE:
+        why = f"The policy {_event(m)} in {m.success:.2g} of the paths, and random and constant controls hardly ever."
+        yield Reason("doubtful", why, LOOK_AT_SETS)
     if not m.is_wrong(LARGE_GAP) and (m.is_wrong(GAP) or m.bias.matters(BIAS)):
         sign = "above" if m.bias.mean > 0 else "below"
         yield Reason(
@@ -169,6 +171,10 @@ def _doubts(m: Measures):
             f"With shorter time steps success changes by {m.finer.mean:+.3f}.",
             "take a smaller env.dt, or env.dt=auto",
         )
+
+
+def _event(m: Measures) -> str:
+    return "stays out of the avoid set" if m.invariance else "reaches the target"
 
 
 def describe(m: Measures, reasons: list[Reason]) -> list[str]:

@@ -1,7 +1,9 @@
 """Points on the faces of A and B, and initial states of episodes near them.
 
-A face is found by bisection of the segment from a point inside a set to one outside both sets. Points inside are found
-by sampling a box twice as wide as `states`, and where that finds few of them, by descent of the levels of the set.
+A face is found by bisection of the segment from a point inside a set to one outside both sets. Half of the points
+outside, and of those inside as far as sampling finds them, are from `states`, and half from a box twice as wide. From
+states everywhere, descent of the levels of the set finds as many points inside: parts of a set that are apart, such as
+two targets in one level, have points however small they are.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pirl_rl.descent import descended
+from pirl_rl.descent import bisected, descended
 from pirl_rl.errors import ArgumentError, ProblemError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.initial_states import InitialStates, mixed, sample_interior
@@ -20,11 +22,8 @@ from pirl_rl.sampling.initial_states import InitialStates, mixed, sample_interio
 FACE_POOL = 16_384
 """The number of points on the faces that are found once, and from which samples are drawn."""
 
-BISECTIONS = 50
-"""The number of halvings of a segment between a point inside a set and one outside; enough for double precision."""
-
-FEW = 256
-"""With fewer sampled points in a set than this, points that are found by descent are added."""
+DESCENTS = 256
+"""The number of states from which the levels of each part of a set are descended."""
 
 
 class Faces(NamedTuple):
@@ -55,26 +54,26 @@ def find_faces(problem: ReachAvoidProblem, rng: torch.Generator) -> Faces:
         outside = sample_interior(problem, problem.states, len(points), rng, points.dtype)
         return _single(points, values, outside)
     wide = problem.states.expand(2.0)
-    candidates = wide.sample(4 * FACE_POOL, rng, dtype=torch.float64)
+    # In a wide box alone hardly any point would be near `states` if these have many coordinates.
+    candidates = torch.cat([box.sample(2 * FACE_POOL, rng, dtype=torch.float64) for box in (problem.states, wide)])
     interior = candidates[problem.interior(candidates)]
-    if len(interior) < FEW:
-        interior = torch.cat([interior, sample_interior(problem, problem.states, FEW, rng, torch.float64)])
+    if len(interior) < DESCENTS:
+        interior = torch.cat([interior, sample_interior(problem, problem.states, DESCENTS, rng, torch.float64)])
     found = []
     for name, absorbs, value, levels in _sets(problem):
         parts = [_inside(absorbs, part, candidates, problem, rng) for part in levels]
-        parts = [inside for inside in parts if len(inside)]
+        parts = [ways for ways in parts if ways]
         if not parts:
             raise ProblemError(
                 f"{type(problem).__name__}: no point of the {name} was found, neither among {len(candidates)} points "
                 f"of {wide} nor by descent of its levels; expected a set that overlaps this box, and levels that fall "
                 "towards it"
             )
-        # Each part of a union has the same number of points, however small it is.
+        # Each part of a union has the same number of points, however small it is, half of them from each way.
         count = FACE_POOL // 2 // len(parts)
-        a = torch.cat([inside[torch.randint(len(inside), (count,), generator=rng)] for inside in parts])
-        count = len(a)
-        b = interior[torch.randint(len(interior), (count,), generator=rng)]
-        face = _bisect(absorbs, a, b)
+        a = torch.cat([_drawn(inside, count // len(ways), rng) for ways in parts for inside in ways])
+        b = _drawn(interior, len(a), rng)
+        face = bisected(absorbs, a, b)
         near = wide.contains(face)
         found.append((face[near], torch.full((int(near.sum()),), value), b[near]))
     if not found:
@@ -154,22 +153,16 @@ def _sets(problem: ReachAvoidProblem) -> list[tuple[str, Levels, float, list[Lev
 
 def _inside(
     absorbs: Levels, part: Levels, candidates: Tensor, problem: ReachAvoidProblem, rng: torch.Generator
-) -> Tensor:
-    """Points (K, n) of a part of a set: the candidates in it, and if they are few, points found by descent."""
-    inside = candidates[(part(candidates) <= 0).all(-1)]
-    if len(inside) < FEW:
-        starts = problem.states.sample(FEW, rng, candidates.dtype)
-        inside = torch.cat([inside, descended(part, starts, problem.states)])
-    return inside[(part(inside) <= 0).all(-1) & absorbs(inside)]
+) -> list[Tensor]:
+    """Points (K, n) of a part of a set: the candidates in it, and points found by descent, as far as there are any."""
+    starts = problem.states.sample(DESCENTS, rng, candidates.dtype)
+    ways = (x[(part(x) <= 0).all(-1) & absorbs(x)] for x in (candidates, descended(part, starts, problem.states)))
+    return [inside for inside in ways if len(inside)]
 
 
-def _bisect(absorbs: Levels, inside: Tensor, outside: Tensor) -> Tensor:
-    """The points (N, n) at which the segments from points inside to points outside leave the set."""
-    for _ in range(BISECTIONS):
-        middle = (inside + outside) / 2
-        held = absorbs(middle).unsqueeze(-1)
-        inside, outside = torch.where(held, middle, inside), torch.where(held, outside, middle)
-    return inside
+def _drawn(points: Tensor, count: int, rng: torch.Generator) -> Tensor:
+    """So many of the points (K, n), drawn with replacement."""
+    return points[torch.randint(len(points), (count,), generator=rng)]
 
 
 def _single(points: Tensor, values: Tensor, outside: Tensor) -> Faces:
