@@ -10,16 +10,19 @@ from torch import Tensor
 from pirl_rl.sets import Box
 
 STEPS = 400
-"""The number of steps of the descent."""
+"""The number of steps of a descent that finds thin sets."""
+
+FEWER_STEPS = 100
+"""The number of steps that suffice where a set is not thin, and its parts are looked for."""
 
 FIRST, LAST = 0.05, 1e-6
-"""Sizes of the first and the last of these steps, in coordinates in which the box is [-1, 1]^n."""
+"""Sizes of the first and the last of `STEPS` steps, in coordinates in which the box is [-1, 1]^n."""
 
 BISECTIONS = 50
 """The number of halvings of a segment between a point inside a set and one outside; enough for double precision."""
 
 
-def descended(constraints: Callable[[Tensor], Tensor], x: Tensor, box: Box) -> Tensor:
+def descended(constraints: Callable[[Tensor], Tensor], x: Tensor, box: Box, steps: int = STEPS) -> Tensor:
     """Points (N, n) where the largest of several levels is low, found by Adam from the states x (N, n).
 
     They stay within a box twice as wide as `box`, and need not lie in the set.
@@ -28,15 +31,16 @@ def descended(constraints: Callable[[Tensor], Tensor], x: Tensor, box: Box) -> T
         constraints: the levels (N, k) at states (N, n), differentiable; all of them are <= 0 in the set.
         x: where the descent starts.
         box: gives the scale of the steps.
+        steps: their number; the fewer, the longer is each, so that all together lead as far.
     """
 
     def level(z: Tensor) -> Tensor:
         return constraints(box.wrap(box.denormalize(z))).amax(-1)
 
     z = box.normalize(x).clone().requires_grad_()
-    slope, optimizer = torch.func.grad(lambda z: level(z).sum()), torch.optim.Adam([z], lr=FIRST)
-    decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST / FIRST) ** (1 / STEPS))
-    for _ in range(STEPS):
+    slope, optimizer = torch.func.grad(lambda z: level(z).sum()), torch.optim.Adam([z], lr=FIRST * STEPS / steps)
+    decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST / FIRST) ** (1 / steps))
+    for _ in range(steps):
         z.grad = slope(z.detach())
         optimizer.step()
         decay.step()

@@ -130,6 +130,20 @@ class Indicator(ZermeloBoat):
         return torch.where(super().target_level(x) <= 0, -1.0, 1.0).to(x)
 
 
+class FlatTarget(ZermeloBoat):
+    def target_level(self, x):
+        return super().target_level(x).clamp(min=0).square()
+
+
+class FlatAvoidSet(ZermeloBoat):
+    def avoid_constraints(self, x):
+        return super().avoid_constraints(x) ** 3
+
+
+class NumberAsPayoff(ZermeloBoat):
+    payoff = 2
+
+
 class DetachedLevel(ZermeloBoat):
     def target_level(self, x):
         return super().target_level(x.detach())
@@ -302,6 +316,9 @@ FAULTS = [
     (ReversedTarget, "warning", "target_level", "must be <= 0 inside"),
     (ReversedAvoid, "warning", "avoid_level", "must be <= 0 inside"),
     (Indicator, "warning", "target_level", "derivative is 0"),
+    (FlatTarget, "warning", "target_level", "no slope at the face of the target"),
+    (FlatAvoidSet, "warning", "avoid_constraints", "no slope at the face of the avoid set"),
+    (NumberAsPayoff, "error", "payoff", "expected one of pirl_rl.payoffs, got 2"),
     (DetachedLevel, "warning", "target_level", "derivative is 0"),
     (OnOff, "warning", "drift", "derivative is 0"),
     (UndefinedBranch, "error", "avoid_level", "A branch of torch.where that is not taken"),

@@ -61,6 +61,7 @@ def examine(problem: ReachAvoidProblem, dt: float | None = None, substeps: int |
         [methods.finite, methods.derivatives],
         [level_sets.agreement, level_sets.sizes, level_sets.overlap, level_sets.places],
         [
+            level_sets.slopes,
             dynamics.controls,
             dynamics.noise,
             dynamics.units_of_time,
@@ -90,6 +91,8 @@ def attributes(problem: ReachAvoidProblem) -> Iterator[Finding]:
             yield found(problem, "error", name, f"expected a pirl_rl.Box, got {box!r}.")
         elif name == "controls" and box.periodic:
             yield found(problem, "error", name, f"only states may be periodic, got {box}.")
+    if not callable(problem.payoff) or not hasattr(problem.payoff, "epsilon"):
+        yield found(problem, "error", "payoff", f"expected one of pirl_rl.payoffs, got {problem.payoff!r}.")
     if problem.objective not in ("reach-avoid", "invariance"):
         message = f"expected 'reach-avoid' or 'invariance', got {problem.objective!r}."
         yield found(problem, "error", "objective", message)

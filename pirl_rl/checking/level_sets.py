@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import torch
+from torch import Tensor
 
 from pirl_rl.checking.findings import Finding, found
 from pirl_rl.checking.samples import Samples, defines
 from pirl_rl.descent import descended
 from pirl_rl.errors import ProblemError
-from pirl_rl.problem import RANDOM_STATES
-from pirl_rl.sampling.faces import find_faces
+from pirl_rl.problem import RANDOM_STATES, ReachAvoidProblem
 from pirl_rl.sampling.initial_states import sample_interior
 
 STARTS = 64
@@ -19,6 +19,12 @@ STARTS = 64
 
 MOST = 0.95
 """The share of the box from which a set is suspected to have the wrong sign."""
+
+NEAR = 1e-3
+"""How far from a face its level is taken, as a share of the way to a state outside."""
+
+LEAST_SLOPE = 0.1
+"""The slope of a level at a face, in units of its mean slope over the way from there, below which it counts as flat."""
 
 
 def agreement(samples: Samples) -> Iterator[Finding]:
@@ -68,7 +74,7 @@ def places(samples: Samples) -> Iterator[Finding]:
     """Both sets must exist near the box, and should overlap it."""
     problem = samples.problem
     try:
-        faces = find_faces(problem, torch.Generator().manual_seed(0))
+        faces = samples.faces
     except ProblemError as error:
         part = _part(samples, "avoid" if "of the avoid set" in str(error) else "target")
         yield found(problem, "error", part, f"{error}".partition(": ")[2] + ".")
@@ -76,8 +82,8 @@ def places(samples: Samples) -> Iterator[Finding]:
     # The descent stays in a box twice as wide as the one that it is given.
     rng, narrow = torch.Generator().manual_seed(0), problem.states.expand(0.505)
     for what, part, inside in _sets(samples):
-        levels = problem.reached_constraints if what == "target" else problem.avoid_level
-        lowest = descended(lambda x, levels=levels: levels(x).reshape(len(x), -1), narrow.sample(STARTS, rng), narrow)
+        level = _level(problem, what)
+        lowest = descended(lambda x, level=level: level(x).unsqueeze(-1), narrow.sample(STARTS, rng), narrow)
         absorbs = problem.reached if what == "target" else problem.failed
         own = faces.points[faces.values.round() == (what == "target")]
         seen = (inside.any(), absorbs(lowest).any(), problem.states.expand(1.01).contains(own).any())
@@ -87,6 +93,31 @@ def places(samples: Samples) -> Iterator[Finding]:
                 "until it touches the set."
             )
             yield found(problem, "warning", part, message, own[0] if len(own) else None)
+
+
+def slopes(samples: Samples) -> Iterator[Finding]:
+    """Levels must change at a face in proportion to the distance: from the slope follows how likely paths cross it."""
+    problem = samples.problem
+    if problem.faces(1, torch.Generator()) is not None:
+        return
+    faces = samples.faces
+    for what, part, _ in _sets(samples):
+        own = faces.values.round() == (what == "target")
+        face, way = faces.points[own].double(), NEAR * (faces.outside[own] - faces.points[own]).double()
+        level = _level(problem, what)
+        rise = torch.func.jvp(level, (face,), (way,))[1]
+        flat = rise.abs() < LEAST_SLOPE * (level(face + way) - level(face)).abs()
+        if len(face) and flat.double().mean() > 0.5:
+            message = (
+                f"the level has no slope at the face of the {what}, so that paths cross it unseen between the ends of "
+                "a step; expected one that changes there in proportion to the distance, such as the distance itself."
+            )
+            yield found(problem, "warning", part, message, face[flat][0])
+
+
+def _level(problem: ReachAvoidProblem, what: str) -> Callable[[Tensor], Tensor]:
+    """The level (*) of a set, at states (*, n); that of a smoothed payoff for the target."""
+    return problem.avoid_level if what == "avoid set" else lambda x: problem.reached_constraints(x).amax(-1)
 
 
 def _sets(samples: Samples):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from itertools import islice, product
 
 import torch
 from torch import Tensor
 
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.sampling.faces import Faces, find_faces
 
 STATES = 1_024
 """The number of random states in the box, and of those in the box that is half as wide again."""
@@ -49,6 +51,15 @@ class Samples:
         for name in (*LEVELS, "unreachable"):
             if defines(problem, name):
                 self.methods[name] = _of_states(getattr(problem, name))
+
+    @cached_property
+    def faces(self) -> Faces:
+        """Points on the faces of A and B.
+
+        Raises:
+            ProblemError: no point of a set is found.
+        """
+        return find_faces(self.problem, torch.Generator().manual_seed(0))
 
 
 def defines(problem: ReachAvoidProblem, name: str) -> bool:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pirl_rl.descent import bisected, descended
+from pirl_rl.descent import FEWER_STEPS, STEPS, bisected, descended
 from pirl_rl.errors import ArgumentError, ProblemError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.initial_states import InitialStates, mixed, sample_interior
@@ -155,8 +155,13 @@ def _inside(
     absorbs: Levels, part: Levels, candidates: Tensor, problem: ReachAvoidProblem, rng: torch.Generator
 ) -> list[Tensor]:
     """Points (K, n) of a part of a set: the candidates in it, and points found by descent, as far as there are any."""
-    starts = problem.states.sample(DESCENTS, rng, candidates.dtype)
-    ways = (x[(part(x) <= 0).all(-1) & absorbs(x)] for x in (candidates, descended(part, starts, problem.states)))
+
+    def kept(x: Tensor) -> Tensor:
+        return x[(part(x) <= 0).all(-1) & absorbs(x)]
+
+    sampled, starts = kept(candidates), problem.states.sample(DESCENTS, rng, candidates.dtype)
+    steps = STEPS if len(sampled) < DESCENTS else FEWER_STEPS
+    ways = sampled, kept(descended(part, starts, problem.states, steps))
     return [inside for inside in ways if len(inside)]
 
 
