@@ -89,6 +89,7 @@ def test_command_line(cli, trained, tmp_path):
         (["critic.activation=ReLU"], "ReLU"),
         (["critic.hidden=[8]"], "does not fit"),
         (["out=."], "out: expected an empty directory or one with tune.yaml"),
+        (["--config-dir=mine"], "--config-dir=mine: a loop composes its candidates from the choices of the package"),
         (["seed=1,2", "-m"], "-m: a loop runs its candidates itself"),
     ],
     ids=lambda value: value[-1] if isinstance(value, list) else "",

@@ -37,7 +37,7 @@ from omegaconf import DictConfig, OmegaConf
 from pirl_rl.assembly import make_trainer
 from pirl_rl.building import build, convert
 from pirl_rl.commands.baseline import measure
-from pirl_rl.commands.composition import check_overrides, compose, drop_leftovers, register
+from pirl_rl.commands.composition import OTHER_FOLDERS, check_overrides, compose, drop_leftovers, register
 from pirl_rl.commands.console import named_modules, quiet_libraries, reported
 from pirl_rl.commands.loop_settings import counts_of, overrides_of_training, readable
 from pirl_rl.commands.start import adopt_networks
@@ -207,6 +207,12 @@ def main() -> None:
     with reported(Path()):
         if {"-m", "--multirun"} & {*arguments}:
             raise ConfigError("-m: a loop runs its candidates itself, expected candidates=... and parallel=... instead")
+        for text in arguments:
+            if text.startswith(OTHER_FOLDERS):
+                raise ConfigError(
+                    f"{text}: a loop composes its candidates from the choices of the package alone, expected the "
+                    "settings of an experiment of your own as key=value"
+                )
         check_overrides(arguments)
     register()
     try:
