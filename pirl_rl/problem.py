@@ -72,7 +72,10 @@ class ReachAvoidProblem(ABC):
         """sigma(x, u) (*, n, w), in units of the state per sqrt(s), with one column for each noise channel."""
 
     def target_level(self, x: Tensor) -> Tensor:
-        """The level (*) of A at states (*, n), <= 0 inside. A subclass defines this or `target_constraints`."""
+        """The level (*) of A at states (*, n), <= 0 inside. A subclass defines this or `target_constraints`.
+
+        At a face a level changes in proportion to the distance, since its slope gives the probability of a crossing.
+        """
         return self.target_constraints(x).amax(-1)
 
     def target_constraints(self, x: Tensor) -> Tensor:
@@ -100,15 +103,15 @@ class ReachAvoidProblem(ABC):
         return torch.zeros(x.shape[:-1], dtype=torch.bool, device=x.device)
 
     def faces(self, count: int, rng: torch.Generator | None = None) -> tuple[Tensor, Tensor] | None:
-        """Points on the faces of A and B, for sets that are too thin to be found by sampling.
+        """Points on the faces of A and B, for sets that neither sampling nor descent finds.
 
         Args:
             count: the number of points.
             rng: the random generator to draw from.
 
         Returns:
-            Points (count, n) and the value V (count,) there, or None, and then the points are found by bisection of
-            the level functions.
+            Points (count, n) and the value V (count,) there, or None, and then the points are found by sampling,
+            descent and bisection of the level functions.
         """
         return None
 

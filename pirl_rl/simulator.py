@@ -11,8 +11,8 @@ The rule `crossing` names the drift f of a sub-step, and how an exit within it i
   path is a Brownian bridge, which may cross faces, see `pirl_rl.crossings`.
 
 A path that both reaches A and enters B within one sub-step counts as a failure. So does a path that leaves for
-infinity, because its drift grows too fast. Periodic coordinates are brought back into their period at the end of each
-sub-step, before levels are taken there.
+infinity, because its drift grows too fast, or whose state has no number. Periodic coordinates are brought back into
+their period at the end of each sub-step, before levels are taken there.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from numbers import Real
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -42,7 +42,7 @@ ATTEMPTS = 2
 """How often a path may cross the last face of a target with corners in a sub-step, see `enters_intersection`."""
 
 LOST = 1e4
-"""The distance from the center of the box of states, in half widths, beyond which a path never comes back."""
+"""The distance from the center of the box of states, in half widths, beyond which a path counts as lost."""
 
 
 class Step(NamedTuple):
@@ -51,9 +51,9 @@ class Step(NamedTuple):
     Attributes:
         state: states after the step (N, n); a path that ended keeps the state of the sub-step in which it ended.
         reached: paths that reached A (N,) bool.
-        failed: paths that entered B (N,) bool; none of them counts as reached.
+        failed: paths that entered B or were lost (N,) bool; none of them counts as reached.
         noise: the sum of sigma dW over the sub-steps (N, n) until the path ended, in the units of the state. Its mean
-            given the state before the step is zero, because it stops at a stopping time.
+            given the state before the step is zero, but for paths that are lost, because it stops at a stopping time.
     """
 
     state: Tensor
@@ -63,7 +63,7 @@ class Step(NamedTuple):
 
 
 def exit_value(problem: ReachAvoidProblem, step: Step) -> Tensor:
-    """The payoff (N,) of paths that end with this step: 1 if they reached A, 0 if they entered B, else l_eps."""
+    """The payoff (N,) of paths that end with this step: 1 if they reached A, 0 if they failed, else l_eps."""
     payoff = torch.where(step.reached, torch.ones_like(step.state[..., 0]), problem.boundary_value(step.state))
     return torch.where(step.failed, torch.zeros_like(payoff), payoff)
 
@@ -91,7 +91,7 @@ class Simulator:
     problem: ReachAvoidProblem
     dt: float = 0.1
     substeps: int = 1
-    crossing: Literal["bridge", "endpoint"] = "bridge"
+    crossing: str = "bridge"
     compile: bool | None = None
     shared: Simulator | None = field(default=None, init=False, compare=False, repr=False)
 
@@ -160,7 +160,14 @@ class Simulator:
         return Compiled(self._advance, "the simulator") if self.compile else self._advance
 
     @torch.no_grad()
-    def step(self, x: Tensor, u: Tensor, rng: torch.Generator | None = None, dt: Tensor | None = None) -> Step:
+    def step(
+        self,
+        x: Tensor,
+        u: Tensor,
+        rng: torch.Generator | None = None,
+        dt: Tensor | None = None,
+        crossings: bool = True,
+    ) -> Step:
         """Advance paths that are outside A and B by one control step.
 
         Args:
@@ -168,15 +175,18 @@ class Simulator:
             u: physical controls (N, m), held over the step.
             rng: the random generator of the noise and of the crossings.
             dt: the length of the step for each path (N,), in s; default `self.dt` for all.
+            crossings: whether exits are seen between the ends of a sub-step too, where the rule is "bridge". They take
+                most of the time of a step that is not compiled.
         """
         # Each coordinate is made contiguous in memory, because problems unbind states into coordinates. It is always a
         # copy, since the compiler cannot differentiate along a part of a larger tensor.
         x = x.mT.clone(memory_format=torch.contiguous_format).mT
         h = (x.new_tensor(self.dt) if dt is None else dt) / self.substeps
+        self.problem.states.center_and_half_width(x)  # which compiled code would note, and be compiled again
         reached = torch.zeros(x.shape[:-1], dtype=torch.bool, device=x.device)
         failed, noise = reached, x
         for index in range(self.substeps):
-            random = self._draw(x, rng)
+            random = self._draw(x, rng, crossings)
             moved, kick, now_reached, now_failed = self._advanced(x, u, h, *random, self.constant_sigma(x.device))
             if index == 0:
                 x, reached, failed, noise = moved, now_reached & ~now_failed, now_failed, kick
@@ -205,18 +215,24 @@ class Simulator:
         drift = self.problem.drift(x, u)
         if self.crossing == "endpoint":
             return drift
-        middle = self.problem.drift(self.problem.states.wrap(x + drift * (h / 2)), u)
-        # The middle may lie where the physics is undefined, below the bottom of a tank for example.
-        return torch.where(middle.isfinite(), middle, drift)
+        middle = self.problem.states.wrap(x + drift * (h / 2))
+        # The middle may lie where the physics is undefined, below the bottom of a tank for example. And where the drift
+        # has no number, the middle has none, at which a drift may well have one again.
+        if torch.is_grad_enabled():
+            with torch.no_grad():
+                defined = (self.problem.drift(middle, u) + drift).isfinite().all(-1, keepdim=True)
+            return self.problem.drift(torch.where(defined, middle, x), u)
+        at_middle = self.problem.drift(middle, u)
+        return torch.where((at_middle + drift).isfinite(), at_middle, drift)
 
-    def _draw(self, x: Tensor, rng: torch.Generator | None) -> Draws:
+    def _draw(self, x: Tensor, rng: torch.Generator | None, crossings: bool) -> Draws:
         """The random numbers of a sub-step.
 
         They are drawn here, so that `_advance` is a function without side effects, which can be compiled.
         """
         kind = {"generator": rng, "dtype": x.dtype, "device": x.device}
         noise = torch.randn((self.channels, *x.shape[:-1]), **kind)
-        of_target, of_avoid = self._crossings
+        of_target, of_avoid = self._crossings if crossings else (0, 0)
         attempts, faces = ATTEMPTS if of_target > 1 else 1, (*x.shape[:-1], of_target)
         target = torch.rand((attempts, *faces), **kind) if of_target else None
         avoid = torch.rand((*x.shape[:-1], of_avoid), **kind) if of_avoid else None

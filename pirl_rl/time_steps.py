@@ -8,7 +8,7 @@ control step without noise is that of ten times as many.
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -58,7 +58,7 @@ def propose_time_steps(
     substeps: int | None = None,
     samples: int = 1024,
     seed: int = 0,
-    crossing: Literal["bridge", "endpoint"] = "bridge",
+    crossing: str = "bridge",
 ) -> TimeSteps:
     """Choose the control step, which then divides the horizon, and the integration steps of a problem.
 

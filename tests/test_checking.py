@@ -10,7 +10,7 @@ import torch
 import pirl_rl
 import pirl_rl.errors
 from benchmarks.kinds import Orbit
-from pirl_rl import Box, Plane, problems
+from pirl_rl import Box, Plane, payoffs, problems
 from pirl_rl.checking import examine, report
 from pirl_rl.commands.check import main
 from pirl_rl.problems import DoubleIntegrator, DubinsCar, HalfSpace, Pendulum, Reach1D, ZermeloBoat
@@ -135,13 +135,27 @@ class FlatTarget(ZermeloBoat):
         return super().target_level(x).clamp(min=0).square()
 
 
-class FlatAvoidSet(ZermeloBoat):
+class FlatWall(ZermeloBoat):
+    """One of the constraints of the avoid set is flat."""
+
     def avoid_constraints(self, x):
-        return super().avoid_constraints(x) ** 3
+        first, *others = super().avoid_constraints(x).unbind(-1)
+        return torch.stack([first**3, *others], -1)
+
+
+class ClampedTarget(ZermeloBoat):
+    """A level may be 0 all over the set."""
+
+    def target_level(self, x):
+        return super().target_level(x).clamp(min=0)
 
 
 class NumberAsPayoff(ZermeloBoat):
     payoff = 2
+
+
+class ClassAsPayoff(ZermeloBoat):
+    payoff = payoffs.Indicator
 
 
 class DetachedLevel(ZermeloBoat):
@@ -316,9 +330,10 @@ FAULTS = [
     (ReversedTarget, "warning", "target_level", "must be <= 0 inside"),
     (ReversedAvoid, "warning", "avoid_level", "must be <= 0 inside"),
     (Indicator, "warning", "target_level", "derivative is 0"),
-    (FlatTarget, "warning", "target_level", "no slope at the face of the target"),
-    (FlatAvoidSet, "warning", "avoid_constraints", "no slope at the face of the avoid set"),
+    (FlatTarget, "warning", "target_level", "no slope at a face of the target"),
+    (FlatWall, "warning", "avoid_constraints", "no slope at a face of the avoid set"),
     (NumberAsPayoff, "error", "payoff", "expected one of pirl_rl.payoffs, got 2"),
+    (ClassAsPayoff, "error", "payoff", "got <class"),
     (DetachedLevel, "warning", "target_level", "derivative is 0"),
     (OnOff, "warning", "drift", "derivative is 0"),
     (UndefinedBranch, "error", "avoid_level", "A branch of torch.where that is not taken"),
@@ -369,6 +384,24 @@ SUITE = [
 @pytest.mark.parametrize("problem", SUITE)
 def test_the_suite_gives_no_alarm(problem):
     assert report(examine(problem()), ["error", "warning"]) == ""
+
+
+def test_a_level_that_is_zero_all_over_its_set_gives_no_alarm():
+    assert "no slope" not in report(examine(ClampedTarget()))
+
+
+def test_steps_are_checked_by_the_scheme_that_plays_them():
+    """Two Euler steps of 0.25 s turn a state by 0.3 rad and out by 0.02, which midpoint steps do not."""
+
+    class Turn(DoubleIntegrator):
+        def drift(self, x, u):
+            return 0.6 * torch.stack([x[..., 1], -x[..., 0]], -1) + 0.01 * u
+
+    stiff = {
+        crossing: "ten times as many" in report(examine(Turn(), 0.5, 2, crossing))
+        for crossing in ("bridge", "endpoint")
+    }
+    assert stiff == {"bridge": False, "endpoint": True}
 
 
 def test_thirty_dimensions_give_no_alarm():

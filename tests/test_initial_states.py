@@ -266,6 +266,19 @@ def test_where_paths_stay_in_the_box_nothing_is_wider():
     assert torch.equal(draw(problem, law)[1], draw(problem, UniformStates())[1])
 
 
+def test_paths_that_turn_do_not_widen_the_box_by_the_scheme():
+    """From the corners of the box they come as far as its diagonal, and no farther in ten turns of 40 steps each."""
+
+    class Turn(Stream):
+        states = Box([-1.0, -1.0], [1.0, 1.0])
+
+        def drift(self, x, u):
+            return 2 * math.pi * torch.stack([x[..., 1], -x[..., 0]], -1)
+
+    box = WiderStates(UniformStates(), Simulator(Turn(10.0), 1 / 40)).box
+    assert box is None or max(box.high) < 2**0.5
+
+
 def test_a_drift_without_a_value_beyond_the_box_does_not_spoil_the_wider_box():
     """Paths end where they leave the box, so that it stays as it is."""
 

@@ -293,6 +293,19 @@ def test_physics_without_a_value_in_the_target_is_not_asked_there():
     assert step.noise.isfinite().all()
 
 
+def test_the_gradient_of_a_step_without_noise_is_finite_where_its_middle_is_undefined():
+    x, u = torch.tensor([[1e-3], [1.0]]), torch.zeros(2, 1, requires_grad=True)
+
+    class Filled(Undefined):
+        def drift(self, x: Tensor, u: Tensor) -> Tensor:
+            return super().drift(x, u) + u
+
+    (slope,) = torch.autograd.grad(Simulator(Filled(), 0.4, 1).flow(x, u).sum(), u)
+    # The first is a step of Euler's, the second has the factor 1 - h/4 of the drift's slope -1/(2 sqrt(y)) at y near 1.
+    assert slope[0].item() == pytest.approx(0.4)
+    assert slope[1].item() == pytest.approx(0.4 * (1 - 0.4 / 4), rel=0.02)
+
+
 @pytest.mark.parametrize("crossing", ["bridge", "endpoint"])
 def test_the_noise_of_a_step_is_that_of_the_path_until_it_ended(crossing):
     """Without drift, a path has moved by its noise alone."""

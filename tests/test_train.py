@@ -208,7 +208,7 @@ def test_resume_with_more_updates(finished, cli, tmp_path):
         ("-m", "-m"),
         ("trainer.updates=[", "["),
         ("critic.hidden=[8]", "does not fit"),
-        ("seed=5", "seed=5: the random numbers go on from the checkpoint, expected the seed "),
+        ("seed=5", "seed=5: a run goes on with the random numbers of its checkpoint, expected the seed "),
     ],
 )
 def test_resume_refuses(override, told, finished, cli):

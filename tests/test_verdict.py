@@ -158,7 +158,8 @@ GOOD = Measures(
         ({"gap": 0.2}, "failed", "V is wrong by 0.20"),
         ({"over_constant": Difference(0.1, 0.01)}, "failed", "The constant control [1] succeeds more often"),
         ({"success": 0.0, "high": 0.0001, "random": 0.0, "constant": 0.0}, "failed", "nor does a random"),
-        ({"success": 0.0, "high": 0.0001, "constant": 0.3}, "failed", "while another reaches 0.300"),
+        ({"success": 0.0, "high": 0.0001, "constant": 0.3}, "failed", "while another control does in 0.3 of the paths"),
+        ({"success": 0.0, "high": 0.0001, "random": 0.0, "constant": 0.004}, "failed", "control does in 0.004 of the"),
         ({"success": 0.0, "high": 0.0001, "invariance": True}, "failed", "never stays out of the avoid set"),
         (
             {"success": 2e-3, "high": 3e-3, "random": 1e-3, "constant": 0.0},

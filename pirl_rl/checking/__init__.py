@@ -22,35 +22,40 @@ __all__ = ["Finding", "check", "examine", "report"]
 Check = Callable[[Samples], Iterable[Finding]]
 
 
-def check(problem: ReachAvoidProblem, dt: float | None = None, substeps: int | None = None) -> list[Finding]:
+def check(
+    problem: ReachAvoidProblem, dt: float | None = None, substeps: int | None = None, crossing: str = "bridge"
+) -> list[Finding]:
     """The warnings and notes of `examine`.
 
     Raises:
         ProblemError: if the problem has errors; the message lists them.
     """
-    findings = examine(problem, dt, substeps)
+    findings = examine(problem, dt, substeps, crossing)
     if errors := report(findings, ["error"]):
         raise ProblemError(errors.removeprefix("error").strip())  # the commands print `error:` before a message
     return findings
 
 
-def examine(problem: ReachAvoidProblem, dt: float | None = None, substeps: int | None = None) -> list[Finding]:
+def examine(
+    problem: ReachAvoidProblem, dt: float | None = None, substeps: int | None = None, crossing: str = "bridge"
+) -> list[Finding]:
     """All findings about a problem.
 
     Args:
         problem: the problem.
         dt: the control step with which it will be simulated, in s; by default the one that is proposed.
         substeps: the number of integration steps in a control step; by default the proposed number.
+        crossing: the rule with which it will be simulated, see `pirl_rl.simulator`.
 
     Raises:
-        ArgumentError: `problem` is no problem, or a time step is out of range.
+        ArgumentError: `problem` is no problem, a time step is out of range, or `crossing` is unknown.
     """
     if not isinstance(problem, ReachAvoidProblem):
         raise ArgumentError(f"problem: expected an object of a subclass of ReachAvoidProblem, got {problem!r}")
     findings = [*attributes(problem)]
     if findings:
         return findings
-    check_time_steps(problem, dt, substeps)
+    check_time_steps(problem, dt, substeps, crossing)
     samples = Samples(problem)
     groups: list[list[Check]] = [
         [methods.calls],
@@ -66,7 +71,7 @@ def examine(problem: ReachAvoidProblem, dt: float | None = None, substeps: int |
             dynamics.noise,
             dynamics.units_of_time,
             dynamics.angles,
-            lambda samples: dynamics.steps(samples, dt, substeps),
+            lambda samples: dynamics.steps(samples, dt, substeps, crossing),
             answers.exact_value,
             answers.optimal_control,
             answers.planes,
@@ -91,7 +96,7 @@ def attributes(problem: ReachAvoidProblem) -> Iterator[Finding]:
             yield found(problem, "error", name, f"expected a pirl_rl.Box, got {box!r}.")
         elif name == "controls" and box.periodic:
             yield found(problem, "error", name, f"only states may be periodic, got {box}.")
-    if not callable(problem.payoff) or not hasattr(problem.payoff, "epsilon"):
+    if isinstance(problem.payoff, type) or not callable(problem.payoff) or not hasattr(problem.payoff, "epsilon"):
         yield found(problem, "error", "payoff", f"expected one of pirl_rl.payoffs, got {problem.payoff!r}.")
     if problem.objective not in ("reach-avoid", "invariance"):
         message = f"expected 'reach-avoid' or 'invariance', got {problem.objective!r}."

@@ -115,10 +115,10 @@ def angles(samples: Samples) -> Iterator[Finding]:
                 break
 
 
-def steps(samples: Samples, dt: float | None, substeps: int | None) -> Iterator[Finding]:
+def steps(samples: Samples, dt: float | None, substeps: int | None, crossing: str) -> Iterator[Finding]:
     """One control step must agree with one of ten times as many integration steps, and must not jump over a set."""
     problem = samples.problem
-    chosen = propose_time_steps(problem, dt, substeps)
+    chosen = propose_time_steps(problem, dt, substeps, crossing=crossing)
     if not chosen.error <= TOLERANCE:
         message = (
             f"with a control step of {chosen.dt:.4g} s and {chosen.substeps} integration steps, ten times as many "

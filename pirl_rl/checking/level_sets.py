@@ -24,7 +24,7 @@ NEAR = 1e-3
 """How far from a face its level is taken, as a share of the way to a state outside."""
 
 LEAST_SLOPE = 0.1
-"""The slope of a level at a face, in units of its mean slope over the way from there, below which it counts as flat."""
+"""The slope of a level at a face, in units of its mean slope along `NEAR`, below which it counts as flat."""
 
 
 def agreement(samples: Samples) -> Iterator[Finding]:
@@ -102,17 +102,25 @@ def slopes(samples: Samples) -> Iterator[Finding]:
         return
     faces = samples.faces
     for what, part, _ in _sets(samples):
-        own = faces.values.round() == (what == "target")
+        on_target = what == "target"
+        own = faces.values.round() == on_target
         face, way = faces.points[own].double(), NEAR * (faces.outside[own] - faces.points[own]).double()
-        level = _level(problem, what)
-        rise = torch.func.jvp(level, (face,), (way,))[1]
-        flat = rise.abs() < LEAST_SLOPE * (level(face + way) - level(face)).abs()
-        if len(face) and flat.double().mean() > 0.5:
-            message = (
-                f"the level has no slope at the face of the {what}, so that paths cross it unseen between the ends of "
-                "a step; expected one that changes there in proportion to the distance, such as the distance itself."
-            )
-            yield found(problem, "warning", part, message, face[flat][0])
+        constraints = problem.reached_constraints if on_target else problem.avoid_constraints
+        levels = problem.states.within_period(constraints)
+        here = levels(face)
+        # Just outside, since a level may be 0 all over the set.
+        slope = torch.func.jvp(levels, (face + way / 100,), (way,))[1]
+        flat = slope.abs() < LEAST_SLOPE * (levels(face + way) - here).abs()
+        active = here.argmax(-1) if on_target else here.argmin(-1)
+        for index in active.unique():
+            at = face[(active == index) & flat[:, index]]
+            if 2 * len(at) > int((active == index).sum()):
+                message = (
+                    f"the level has no slope at a face of the {what}, so that paths cross it unseen between the ends "
+                    "of a step; expected one that changes there in proportion to the distance."
+                )
+                yield found(problem, "warning", part, message, at[0])
+                break
 
 
 def _level(problem: ReachAvoidProblem, what: str) -> Callable[[Tensor], Tensor]:

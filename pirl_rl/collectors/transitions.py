@@ -4,8 +4,8 @@ With `control_variate`, the noise of the physics is taken out of the returns. Ov
 
     y = sum_k r_k + (1 - d) V(tau_n, x_n) - sum_k grad V(tau_k, x_k) . (sigma dW)_k         Eq. (control_variate)
 
-has the same mean as without the last sum, whatever V is, because the increment of the Brownian motion in a step has
-mean zero and is independent of all that came before. Where V is exact, Ito's formula says that the last sum is the
+has the same mean as without the last sum, whatever V is, because sigma dW, summed in each step until the path ends, has
+mean zero given all that came before. Where V is exact, Ito's formula says that the last sum is the
 deviation of the return from its mean, up to the size of a step. So the returns become more certain while V is learned.
 The cost is one gradient of V at each step, for any number of noise channels.
 """

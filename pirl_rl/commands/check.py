@@ -31,6 +31,7 @@ from pirl_rl.checking import Finding, check, examine, report
 from pirl_rl.commands.console import program, reported
 from pirl_rl.errors import ConfigError
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.simulator import Simulator
 
 
 @program
@@ -59,7 +60,8 @@ def check_before_training(config: DictConfig, problem: ReachAvoidProblem) -> Non
     """
     # The word `auto` leaves a step to the package, and an environment of one's own may have no such setting.
     dt, substeps = (None if isinstance(value := config.env.get(name), str) else value for name in ("dt", "substeps"))
-    if warnings := report(check(problem, dt, substeps), ["warning"]):
+    crossing = config.env.get("crossing", Simulator.crossing)
+    if warnings := report(check(problem, dt, substeps, crossing), ["warning"]):
         print(warnings, flush=True)
 
 

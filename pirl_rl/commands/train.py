@@ -214,7 +214,9 @@ def reopened(
                 raise ConfigError(f"{text}: the run has begun already; start= is for new runs, without resume=")
             before, after = override(config, text)
             if text.startswith("seed=") and before != after and run.last.exists():
-                raise ConfigError(f"{text}: the random numbers go on from the checkpoint, expected the seed {before}")
+                raise ConfigError(
+                    f"{text}: a run goes on with the random numbers of its checkpoint, expected the seed {before}"
+                )
             if before != after and not text.startswith("trust="):  # which counts for this command alone
                 print(f"resume: {text.partition('=')[0]} was {before}, and is {after} from now on", flush=True)
         if config.get("grid") is not None:

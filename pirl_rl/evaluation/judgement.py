@@ -124,7 +124,9 @@ def _failures(m: Measures):
         return
     others = max(m.random, m.constant)
     if m.success == 0 or (m.high < RARE and others >= RARE):
-        also = "nor does a random or a constant control" if others < RARE else f"while another reaches {others:.3f}"
+        also = "nor does a random or a constant control"
+        if others > 0:
+            also = f"while another control does in {others:.2g} of the paths"
         how = "never" if m.success == 0 else "hardly ever"
         yield Reason("failed", f"The policy {how} {_event(m)}, {also}.", LOOK_AT_SETS)
     if m.over_constant.mean > 0 and m.over_constant.matters():

@@ -11,6 +11,7 @@ import gymnasium
 from pirl_rl.envs import ReachAvoidEnv
 from pirl_rl.gymnasium.environments import ReachAvoidGym, ReachAvoidVectorGym
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.simulator import Simulator
 from pirl_rl.time_steps import propose_time_steps
 
 PROBLEMS = "pirl_rl.problems"
@@ -59,19 +60,20 @@ def _problem(problem: str | ReachAvoidProblem) -> ReachAvoidProblem:
 def _with_time_steps(
     named: str | ReachAvoidProblem, problem: ReachAvoidProblem, settings: dict[str, Any]
 ) -> dict[str, Any]:
-    dt, substeps = settings.get("dt"), settings.get("substeps")
+    dt, substeps, crossing = (settings.get(name) for name in ("dt", "substeps", "crossing"))
     if dt is not None and substeps is not None:
         return settings
     # The proposal takes seconds, and a process often makes several environments of one problem.
-    proposed = _proposed(named, dt, substeps) if isinstance(named, str) else _time_steps(problem, dt, substeps)
+    given = dt, substeps, crossing or Simulator.crossing
+    proposed = _proposed(named, *given) if isinstance(named, str) else _time_steps(problem, *given)
     return {**settings, "dt": proposed[0], "substeps": proposed[1]}
 
 
 @cache
-def _proposed(name: str, dt: float | None, substeps: int | None) -> tuple[float, int]:
-    return _time_steps(_problem(name), dt, substeps)
+def _proposed(name: str, dt: float | None, substeps: int | None, crossing: str) -> tuple[float, int]:
+    return _time_steps(_problem(name), dt, substeps, crossing)
 
 
-def _time_steps(problem: ReachAvoidProblem, dt: float | None, substeps: int | None) -> tuple[float, int]:
-    steps = propose_time_steps(problem, dt, substeps)
+def _time_steps(problem: ReachAvoidProblem, dt: float | None, substeps: int | None, crossing: str) -> tuple[float, int]:
+    steps = propose_time_steps(problem, dt, substeps, crossing=crossing)
     return steps.dt, steps.substeps

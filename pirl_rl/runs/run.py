@@ -124,7 +124,7 @@ class Run:
             x: initial states (N, n) in SI units.
             dt: control step in s; the default of this and of the next two is that of the training.
             substeps: number of integration steps in a control step.
-            crossing: how exits within a step are detected, see `pirl_rl.simulator`.
+            crossing: the rule for the drift of an integration step and for exits within it, see `pirl_rl.simulator`.
             seed: seed of the noise.
         """
         times, state, answer = self._starts(tau, x)
@@ -151,7 +151,7 @@ class Run:
             rollouts: number of paths from each state.
             dt: longest control step in s; the default of this and of the next two is that of the training.
             substeps: number of integration steps in a control step.
-            crossing: how exits within a step are detected, see `pirl_rl.simulator`.
+            crossing: the rule for the drift of an integration step and for exits within it, see `pirl_rl.simulator`.
             seed: seed of the noise.
             confidence: confidence level of the interval, which is approximate (Wilson 1927).
         """
@@ -198,7 +198,7 @@ class Run:
             success: the wanted probability of `threshold`.
             dt: control step in s; the default of this and of the next two is that of the evaluators.
             substeps: number of integration steps in a control step.
-            crossing: how exits within a step are detected, see `pirl_rl.simulator`.
+            crossing: the rule for the drift of an integration step and for exits within it, see `pirl_rl.simulator`.
             confidence: the level of each claim.
             picked_from: the number of runs, or seeds, out of which this one was picked on the same data.
             seed: seed of starts and noise, separate from those of all evaluators.

@@ -1,9 +1,9 @@
 """Points on the faces of A and B, and initial states of episodes near them.
 
-A face is found by bisection of the segment from a point inside a set to one outside both sets. Half of the points
-outside, and of those inside as far as sampling finds them, are from `states`, and half from a box twice as wide. From
-states everywhere, descent of the levels of the set finds as many points inside: parts of a set that are apart, such as
-two targets in one level, have points however small they are.
+A face is found by bisection of the segment from a point inside a set to one outside both sets. Half of the candidates
+for both are drawn from `states`, and half from a box twice as wide. From states everywhere, descent of the levels of
+the set finds as many points inside again: parts of a set that are apart, such as two targets in one level, have points
+however small they are.
 """
 
 from __future__ import annotations
@@ -154,15 +154,18 @@ def _sets(problem: ReachAvoidProblem) -> list[tuple[str, Levels, float, list[Lev
 def _inside(
     absorbs: Levels, part: Levels, candidates: Tensor, problem: ReachAvoidProblem, rng: torch.Generator
 ) -> list[Tensor]:
-    """Points (K, n) of a part of a set: the candidates in it, and points found by descent, as far as there are any."""
+    """Points (K, n) of a part of a set: the candidates in it, and points found by descent, as far as there are any.
+
+    A few candidates are joined to the others, since they would be drawn again and again.
+    """
 
     def kept(x: Tensor) -> Tensor:
         return x[(part(x) <= 0).all(-1) & absorbs(x)]
 
     sampled, starts = kept(candidates), problem.states.sample(DESCENTS, rng, candidates.dtype)
-    steps = STEPS if len(sampled) < DESCENTS else FEWER_STEPS
-    ways = sampled, kept(descended(part, starts, problem.states, steps))
-    return [inside for inside in ways if len(inside)]
+    few = len(sampled) < DESCENTS
+    deep = kept(descended(part, starts, problem.states, STEPS if few else FEWER_STEPS))
+    return [inside for inside in ([torch.cat([sampled, deep])] if few else [sampled, deep]) if len(inside)]
 
 
 def _drawn(points: Tensor, count: int, rng: torch.Generator) -> Tensor:
