@@ -21,7 +21,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from numbers import Real
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -33,6 +33,9 @@ from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sigma import constant_matrix, times
 from pirl_rl.structure import has_controlled_noise, noise_channels
+
+Crossing = Literal["bridge", "endpoint"]
+"""The rule for the drift of a sub-step and for exits within it."""
 
 Draws = tuple[Tensor, Tensor | None, Tensor | None, Tensor | None]
 """The random numbers of a sub-step: normal (w, N) for the noise, and for crossings uniform (R, N, k) for R attempts at
@@ -68,6 +71,28 @@ def exit_value(problem: ReachAvoidProblem, step: Step) -> Tensor:
     return torch.where(step.failed, torch.zeros_like(payoff), payoff)
 
 
+def midpoint_drift(problem: ReachAvoidProblem, x: Tensor, u: Tensor, drift: Tensor, h: Tensor | float) -> Tensor:
+    """f(x + f(x, u) h/2, u) (N, n), the drift at the middle of a step of the length h without noise.
+
+    It is f(x, u) where the middle lies at a state at which the physics is undefined, as inside a set.
+
+    Args:
+        problem: the physics.
+        x: states (N, n).
+        u: physical controls (N, m).
+        drift: f(x, u) (N, n).
+        h: the length of the step in s, which broadcasts with (N, n).
+    """
+    middle = problem.states.wrap(x + drift * (h / 2))
+    # Where the drift has no number the middle has none, and there a drift may well have one again: the sum has none.
+    if torch.is_grad_enabled():
+        with torch.no_grad():
+            defined = (problem.drift(middle, u) + drift).isfinite().all(-1, keepdim=True)
+        return problem.drift(torch.where(defined, middle, x), u)
+    at_middle = problem.drift(middle, u)
+    return torch.where((at_middle + drift).isfinite(), at_middle, drift)
+
+
 @dataclass(frozen=True)
 class Simulator:
     """Integrates a problem over one control step.
@@ -91,7 +116,7 @@ class Simulator:
     problem: ReachAvoidProblem
     dt: float = 0.1
     substeps: int = 1
-    crossing: str = "bridge"
+    crossing: Crossing = "bridge"
     compile: bool | None = None
     shared: Simulator | None = field(default=None, init=False, compare=False, repr=False)
 
@@ -213,17 +238,7 @@ class Simulator:
     def _drift(self, x: Tensor, u: Tensor, h: Tensor | float) -> Tensor:
         """The drift f (N, n) of Eq. (sub_step) with a length h that broadcasts with (N, n)."""
         drift = self.problem.drift(x, u)
-        if self.crossing == "endpoint":
-            return drift
-        middle = self.problem.states.wrap(x + drift * (h / 2))
-        # The middle may lie where the physics is undefined, below the bottom of a tank for example. And where the drift
-        # has no number, the middle has none, at which a drift may well have one again.
-        if torch.is_grad_enabled():
-            with torch.no_grad():
-                defined = (self.problem.drift(middle, u) + drift).isfinite().all(-1, keepdim=True)
-            return self.problem.drift(torch.where(defined, middle, x), u)
-        at_middle = self.problem.drift(middle, u)
-        return torch.where((at_middle + drift).isfinite(), at_middle, drift)
+        return drift if self.crossing == "endpoint" else midpoint_drift(self.problem, x, u, drift, h)
 
     def _draw(self, x: Tensor, rng: torch.Generator | None, crossings: bool) -> Draws:
         """The random numbers of a sub-step.
@@ -232,7 +247,8 @@ class Simulator:
         """
         kind = {"generator": rng, "dtype": x.dtype, "device": x.device}
         noise = torch.randn((self.channels, *x.shape[:-1]), **kind)
-        of_target, of_avoid = self._crossings if crossings else (0, 0)
+        counts = self._crossings  # outside of compiled code in any case
+        of_target, of_avoid = counts if crossings else (0, 0)
         attempts, faces = ATTEMPTS if of_target > 1 else 1, (*x.shape[:-1], of_target)
         target = torch.rand((attempts, *faces), **kind) if of_target else None
         avoid = torch.rand((*x.shape[:-1], of_avoid), **kind) if of_avoid else None

@@ -16,7 +16,7 @@ from torch import Tensor
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.rates import Move, across_box, across_sets, fastest_rate
-from pirl_rl.simulator import Simulator
+from pirl_rl.simulator import Crossing, Simulator
 
 SHARES = {"the box": (0.05, 0.1), "the target": (0.5, 0.5), "the avoid set": (0.5, 0.5)}
 """The largest moves of drift and noise in one control step, in widths of the box and depths of the sets."""
@@ -58,7 +58,7 @@ def propose_time_steps(
     substeps: int | None = None,
     samples: int = 1024,
     seed: int = 0,
-    crossing: str = "bridge",
+    crossing: Crossing = "bridge",
 ) -> TimeSteps:
     """Choose the control step, which then divides the horizon, and the integration steps of a problem.
 
@@ -93,7 +93,7 @@ def propose_time_steps(
 
 
 def check_time_steps(
-    problem: ReachAvoidProblem, dt: float | None, substeps: int | None, crossing: str = "bridge"
+    problem: ReachAvoidProblem, dt: float | None, substeps: int | None, crossing: Crossing = "bridge"
 ) -> None:
     """Refuse time steps that are out of range; None is a step that is still to be chosen.
 
@@ -135,7 +135,7 @@ def _control_step(horizon: float, moves: list[Move]) -> tuple[float, str]:
     return horizon / steps, limit
 
 
-def _substeps(problem: ReachAvoidProblem, dt: float, crossing: str, rate: float, x: Tensor, u: Tensor) -> int:
+def _substeps(problem: ReachAvoidProblem, dt: float, crossing: Crossing, rate: float, x: Tensor, u: Tensor) -> int:
     """The smallest power of two that resolves the fastest rate and whose error is accepted."""
     count = LEAST_SUBSTEPS
     while count < min(dt * rate, MOST_SUBSTEPS):
@@ -145,7 +145,7 @@ def _substeps(problem: ReachAvoidProblem, dt: float, crossing: str, rate: float,
     return count
 
 
-def _error(problem: ReachAvoidProblem, dt: float, substeps: int, crossing: str, x: Tensor, u: Tensor) -> float:
+def _error(problem: ReachAvoidProblem, dt: float, substeps: int, crossing: Crossing, x: Tensor, u: Tensor) -> float:
     """How far ten times as many sub-steps change a control step without noise, in widths of the box."""
     coarse, fine = (Simulator(problem, dt, count, crossing).flow(x, u) for count in (substeps, 10 * substeps))
     gap = (coarse - fine).abs() / (2 * problem.states.center_and_half_width(x)[1])

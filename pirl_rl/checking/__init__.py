@@ -15,6 +15,7 @@ from pirl_rl.checking.samples import Samples
 from pirl_rl.errors import ArgumentError, ProblemError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sets import Box
+from pirl_rl.simulator import Crossing
 from pirl_rl.time_steps import check_time_steps
 
 __all__ = ["Finding", "check", "examine", "report"]
@@ -23,7 +24,7 @@ Check = Callable[[Samples], Iterable[Finding]]
 
 
 def check(
-    problem: ReachAvoidProblem, dt: float | None = None, substeps: int | None = None, crossing: str = "bridge"
+    problem: ReachAvoidProblem, dt: float | None = None, substeps: int | None = None, crossing: Crossing = "bridge"
 ) -> list[Finding]:
     """The warnings and notes of `examine`.
 
@@ -37,7 +38,7 @@ def check(
 
 
 def examine(
-    problem: ReachAvoidProblem, dt: float | None = None, substeps: int | None = None, crossing: str = "bridge"
+    problem: ReachAvoidProblem, dt: float | None = None, substeps: int | None = None, crossing: Crossing = "bridge"
 ) -> list[Finding]:
     """All findings about a problem.
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from pirl_rl.checking.findings import Finding, found
 from pirl_rl.checking.samples import Samples
 from pirl_rl.rates import across_box
+from pirl_rl.simulator import Crossing
 from pirl_rl.time_steps import TOLERANCE, propose_time_steps
 
 STILL = 1e-3
@@ -115,7 +116,7 @@ def angles(samples: Samples) -> Iterator[Finding]:
                 break
 
 
-def steps(samples: Samples, dt: float | None, substeps: int | None, crossing: str) -> Iterator[Finding]:
+def steps(samples: Samples, dt: float | None, substeps: int | None, crossing: Crossing) -> Iterator[Finding]:
     """One control step must agree with one of ten times as many integration steps, and must not jump over a set."""
     problem = samples.problem
     chosen = propose_time_steps(problem, dt, substeps, crossing=crossing)

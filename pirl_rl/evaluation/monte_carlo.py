@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from numbers import Real
 from statistics import NormalDist
-from typing import Literal, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from torch import Tensor
 from pirl_rl.arguments import Policy, checked_points, checked_policy, seeded
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.simulator import Simulator, Step, exit_value
+from pirl_rl.simulator import Crossing, Simulator, Step, exit_value
 from pirl_rl.time_steps import propose_time_steps
 
 Array = TypeVar("Array", float, np.ndarray, Tensor)
@@ -100,7 +100,7 @@ def monte_carlo(
     rollouts: int = 1000,
     dt: float | None = None,
     substeps: int | None = None,
-    crossing: Literal["bridge", "endpoint"] = "bridge",
+    crossing: Crossing = "bridge",
     seed: int = 0,
     confidence: float = 0.95,
 ) -> Estimate:

@@ -16,6 +16,7 @@ from torch import Tensor
 from pirl_rl.crossings import crossing_probability
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sigma import times
+from pirl_rl.simulator import midpoint_drift
 from pirl_rl.structure import noise_channels
 
 PATHS = 512
@@ -97,6 +98,7 @@ def _mean(
     return result.reshape(len(x), paths).mean(-1)
 
 
+@torch.no_grad()
 def _step(problem: ReachAvoidProblem, spacing: Tensor, policy: Function, tau: Tensor, x: Tensor, normal: Tensor):
     """Where paths from x (P, n) are after a step with the noise (P, w), its length (P,) in s, and the probabilities,
     each (P,), that they have crossed into A or B on the way."""
@@ -105,9 +107,7 @@ def _step(problem: ReachAvoidProblem, spacing: Tensor, policy: Function, tau: Te
     variance = (sigma / spacing.unsqueeze(-1)).square().sum(-1)
     rate = torch.maximum((drift / spacing).abs() / LENGTH, variance / LENGTH**2).amax(-1)
     h = torch.minimum(tau, 1 / rate.clamp(min=1e-12))
-    middle = problem.drift(problem.states.wrap(x + drift * (h / 2).unsqueeze(-1)), u)
-    # Inside a set the drift need not have a value.
-    middle = torch.where(middle.isfinite(), middle, drift)
+    middle = midpoint_drift(problem, x, u, drift, h.unsqueeze(-1))
     moved = x + middle * h.unsqueeze(-1) + times(sigma, normal) * h.sqrt().unsqueeze(-1)
     moved, reached, failed = problem.states.wrap(moved), torch.zeros_like(h), torch.zeros_like(h)
     path, within = (x, moved, sigma, h), problem.states.within_period

@@ -34,6 +34,7 @@ from pirl_rl.crossings import squared_noise
 from pirl_rl.grid.mesh import Mesh, absorbed
 from pirl_rl.passages import entrance_probability, passage_probability
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.simulator import midpoint_drift
 from pirl_rl.structure import has_controlled_noise
 
 WEAK = 2.0
@@ -167,6 +168,7 @@ def _noise_acts_on_faces(problem: ReachAvoidProblem, x: torch.Tensor, u: torch.T
     return (moved | (levels <= 0)).all(-1).numpy()
 
 
+@torch.no_grad()
 def _flow(problem: ReachAvoidProblem, mesh: Mesh, x: torch.Tensor, u: torch.Tensor, dt: float):
     """Where paths without noise from x (M, n) are after dt.
 
@@ -179,10 +181,8 @@ def _flow(problem: ReachAvoidProblem, mesh: Mesh, x: torch.Tensor, u: torch.Tens
     looks = max(1, int(np.ceil(LOOKS * cells)))
     h, ended, end = dt / looks, np.zeros(len(x), bool), np.zeros(len(x))
     for _ in range(looks):
-        slope = problem.drift(x, u)
-        middle = problem.drift(wrap(x + slope * (h / 2)), u)
+        moved = wrap(x + midpoint_drift(problem, x, u, problem.drift(x, u), h) * h)
         # Inside a set the drift need not have a value, as that of a tank below its bottom.
-        moved = wrap(x + torch.where(middle.isfinite(), middle, slope) * h)
         x = torch.where(moved.isfinite(), moved, x)
         inside, value = absorbed(problem, x.numpy())
         end = np.where(inside & ~ended, value, end)

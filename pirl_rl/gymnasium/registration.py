@@ -11,7 +11,7 @@ import gymnasium
 from pirl_rl.envs import ReachAvoidEnv
 from pirl_rl.gymnasium.environments import ReachAvoidGym, ReachAvoidVectorGym
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.simulator import Simulator
+from pirl_rl.simulator import Crossing, Simulator
 from pirl_rl.time_steps import propose_time_steps
 
 PROBLEMS = "pirl_rl.problems"
@@ -70,10 +70,12 @@ def _with_time_steps(
 
 
 @cache
-def _proposed(name: str, dt: float | None, substeps: int | None, crossing: str) -> tuple[float, int]:
+def _proposed(name: str, dt: float | None, substeps: int | None, crossing: Crossing) -> tuple[float, int]:
     return _time_steps(_problem(name), dt, substeps, crossing)
 
 
-def _time_steps(problem: ReachAvoidProblem, dt: float | None, substeps: int | None, crossing: str) -> tuple[float, int]:
+def _time_steps(
+    problem: ReachAvoidProblem, dt: float | None, substeps: int | None, crossing: Crossing
+) -> tuple[float, int]:
     steps = propose_time_steps(problem, dt, substeps, crossing=crossing)
     return steps.dt, steps.substeps

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from numbers import Real
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from omegaconf import DictConfig
@@ -23,11 +23,9 @@ from pirl_rl.grid import GridSolution
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.proofs import LowerBound, Settings, UpperBound, prove_limit, prove_success
 from pirl_rl.sampling.initial_states import InitialStates
-from pirl_rl.simulator import Simulator
+from pirl_rl.simulator import Crossing, Simulator
 from pirl_rl.solution import Solution
 from pirl_rl.switching import candidate_controls
-
-Crossing = Literal["bridge", "endpoint"]
 
 
 class Run:
