@@ -199,6 +199,22 @@ def test_a_later_start_of_the_workers_has_other_seeds(tmp_path, monkeypatch):
     assert len(set(Started.seeds)) == 2
 
 
+def test_a_checkpoint_keeps_its_transitions_while_workers_write(tmp_path):
+    collector = small_trainer(tmp_path, *ASYNC).collector
+    size = collector.buffer.storage.max_size
+
+    def write(number: float) -> None:
+        entry = torch.full((size,), number)
+        collector.buffer.extend(TensorDict({"number": entry, "next": {"number": entry}}, batch_size=[size]))
+
+    write(0.0)
+    kept = collector.state_dict()["buffer"]["transitions"]
+    write(1.0)
+    assert (collector.buffer[:]["number"] == 1).all()
+    assert (kept["number"] == 0).all()
+    assert (kept["next"]["number"] == 0).all()
+
+
 def test_workers_feed_resume_die_and_leave_nothing(tmp_path):
     """One start of processes for all that needs them: the rest of a worker's life in its order."""
     first = small_trainer(tmp_path, *ASYNC, "trainer.updates=4", "method=pirl")

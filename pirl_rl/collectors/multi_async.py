@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any, Literal
 
 import torch
+from tensordict import TensorDict
 from torch import nn
 from torchrl import collectors as torchrl_collectors
 from torchrl.weight_update import SharedMemWeightSyncScheme
@@ -159,7 +160,11 @@ class MultiAsyncCollector:
             self._weights.shutdown()
 
     def state_dict(self) -> dict[str, Any]:
-        return {"buffer": buffer_state(self.buffer, self._rng), "exploration_noise": self.exploration_noise}
+        # Workers go on writing while a checkpoint is written, and its checksums would be those of other numbers.
+        with write_lock(self.buffer):
+            buffer = buffer_state(self.buffer, self._rng)
+            buffer["transitions"] = TensorDict(buffer["transitions"]).clone().to_dict()
+        return {"buffer": buffer, "exploration_noise": self.exploration_noise}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         load_buffer(self.buffer, self._rng, state["buffer"])
