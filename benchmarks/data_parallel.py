@@ -27,7 +27,7 @@ import torch.distributed
 from benchmarks.population import WARM_UP, Measured
 from benchmarks.record import save
 from benchmarks.time_to_accuracy import PLAIN
-from pirl_rl.assembly import make_trainer
+from pirl_rl.assembly import choose, make_problem, make_trainer
 from pirl_rl.commands.composition import compose
 from pirl_rl.gradients import Gradient
 from pirl_rl.trainer import Trainer
@@ -70,6 +70,7 @@ def train(rank: int, processes: int, port: int, settings: list[str], threads: in
     """
     torch.set_num_threads(threads)
     whole = compose("train", settings)
+    choose(whole, make_problem(whole))
     shares = [f"{key}={_read(whole, key) // processes}" for key in SHARED]
     trainer = make_trainer(compose("train", [*settings, *shares]))
     if processes > 1:

@@ -2,16 +2,11 @@
 
     python benchmarks/own_problems.py [NAME ...] [--seed 50] [--settings KEY=VALUE ...] [--out FOLDER] [--json FILE]
 
-Some of them took part in choices, with other seeds and states: Gusty and Slalom in those of the logarithms of the
-levels, the networks and the rules of where episodes start, Gusty, Investor, Loiter, Bicycle, TwoHarbours and Sprint in
-those of the inertia of `BestControl`, Gusty and Investor in that of its budget, and TwoHarbours, Bicycle, Sprint,
-Investor, Gusty, Ferment, FastCharge and Forager in the rules of `pirl_rl.switching`. The crossings of curved faces were
-mended on TwoLink, midpoint steps of the drift were chosen on Duffing, and the grid was mended on FastCharge, Ferment
-and those that docs/recipe.md names. The others took part in nothing. V and the success of the learned policy are
-compared with the grid, in the way of the suite, at 400 states with 1,000 paths from each. There is no truth with three
-states and two controls, or with more states, but for Bearing and Mirror, which are compared with the products of the
-grids of their independent subsystems. A run takes minutes; a finished one is loaded, so that other settings need
-another folder.
+docs/recipe.md says which of the problems had a part in choices, and in which. V and the success of the learned policy
+are compared with the grid, in the way of the suite, at 400 states with 1,000 paths from each. There is no truth with
+three states and two controls, or with more states. Bearing and Mirror are exceptions: they are compared with the
+products of the grids of their independent subsystems. A run takes minutes. A finished run is loaded and not trained
+again, so that other settings need another folder.
 """
 
 from __future__ import annotations

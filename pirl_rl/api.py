@@ -147,7 +147,12 @@ def evaluate(run: Run | str | PathLike[str], *, trust: Sequence[str] = (), **set
     config = copy.deepcopy(run.config)
     typed = typed_settings(settings, config, "evaluation")
     for text in typed:
+        if text.partition(".")[0] in ("actor", "critic", "critics") or text.startswith("env.problem"):
+            raise ConfigError(
+                f"{text}: expected a setting of evaluation or of env, since problem and networks are those of the run; "
+                "load_run(folder, problem=...) opens it with another problem"
+            )
         override(config, text)
-    evaluators = make_evaluators(config.evaluation, "final", [*trust, *named_modules(typed)])
+    evaluators = make_evaluators(config.evaluation, "final", [*run.trust, *trust, *named_modules(typed)])
     simulator = make_evaluation_simulator(config, run.problem)
     return metrics_of(call_evaluators(run.solution, simulator, evaluators))

@@ -12,7 +12,14 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 
-from pirl_rl.automatic import choose_choices, choose_paths, choose_probes, choose_time_steps, choose_updates
+from pirl_rl.automatic import (
+    choose_choices,
+    choose_paths,
+    choose_playing,
+    choose_probes,
+    choose_time_steps,
+    choose_updates,
+)
 from pirl_rl.building import build, convert
 from pirl_rl.curriculum import Stage
 from pirl_rl.envs import ReachAvoidEnv
@@ -76,6 +83,7 @@ def make_problem(config: DictConfig, trust: Sequence[str] = ()) -> ReachAvoidPro
 def choose(config: DictConfig, problem: ReachAvoidProblem) -> str:
     """Replace the settings `auto` of time steps, updates and paths; says why the trace is estimated, if it is."""
     choose_time_steps(config, problem)
+    choose_playing(config, problem)
     choose_updates(config, problem)
     choose_paths(config, problem, make_evaluation_simulator(config, problem))
     return choose_probes(config, problem)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
@@ -17,8 +18,8 @@ from pirl_rl.time_steps import check_time_steps, propose_time_steps
 AUTO = "auto"
 """The value that leaves a choice to the package.
 
-Keys that take it: env.dt, env.substeps, trainer.updates, actor.choices, actor.together, loss.hjb_probes and the entries
-of `PATHS`.
+Keys that take it: env.dt, env.substeps, env.num_envs, collector.n_steps, n_steps of a stage, trainer.updates,
+actor.choices, actor.together, loss.hjb_probes and the entries of `PATHS`.
 """
 
 UPDATES_PER_DIMENSION, FEW_STATES, UPDATES_OF_MANY = 2_300, 3, 2_900
@@ -32,6 +33,9 @@ BASE_COST, MOST_COST = 80, 1_700_000
 
 The number of updates that is chosen, times this sum, is at most MOST_COST.
 """
+
+CONTROL_STEPS, PLAYED_PATHS, RETURN_STEPS = 400, 2_048, 10
+"""The number of paths that are played, and the steps of their returns, with up to so many control steps."""
 
 PATHS = {
     ("success", "episodes"): (10_000, 1_000),
@@ -75,6 +79,27 @@ def choose_time_steps(config: DictConfig, problem: ReachAvoidProblem) -> None:
     chosen = propose_time_steps(problem, **given, crossing=crossing)
     config.env.dt, config.env.substeps = chosen.dt, chosen.substeps
     print(f"time: {chosen.reason}", flush=True)
+
+
+def choose_playing(config: DictConfig, problem: ReachAvoidProblem) -> None:
+    """Replace `auto` in env.num_envs, collector.n_steps and n_steps of the stages by numbers.
+
+    With twice as many control steps half as many paths are played, so that they advance as far between two updates, and
+    returns have twice as many steps. A stage has twice the steps of the run.
+    """
+    steps = problem.horizon / config.env.get("dt", Simulator.dt)
+    # A power of two, since the number of paths has to divide collector.frames_per_batch.
+    stretch = 2 ** round(math.log2(max(1.0, steps / CONTROL_STEPS)))
+    if config.env.get("num_envs") == AUTO:
+        config.env.num_envs = max(1, PLAYED_PATHS // stretch)
+    # The collector may refer to the settings of the method, which a resumed run may change.
+    for node in (config.get("pirl"), config.collector):
+        if node is not None and node.get("n_steps") == AUTO:
+            node.n_steps = RETURN_STEPS * stretch
+    stages = config.get("stages")
+    for stage in stages if isinstance(stages, ListConfig) else ():
+        if isinstance(stage, DictConfig) and stage.get("n_steps") == AUTO:
+            stage.n_steps = 2 * config.collector.get("n_steps", RETURN_STEPS)
 
 
 def choose_updates(config: DictConfig, problem: ReachAvoidProblem) -> None:

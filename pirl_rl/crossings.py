@@ -116,8 +116,12 @@ def enters_intersection(
 
 
 def _chance(before: Tensor, after: Tensor, variance: Tensor) -> Tensor:
-    """The probability (N, k) that a bridge is inside of a face at some time, 1 where it is inside at one end."""
-    return torch.where((before > 0) & (after > 0), _probability(before, after, variance), torch.ones_like(after))
+    """The probability (N, k) that a bridge is inside of a face at some time, 1 where it is inside at one end.
+
+    It is 0 where a level has no number, as a state is in no set there.
+    """
+    inside = ((before <= 0) | (after <= 0)).to(after)
+    return torch.where((before > 0) & (after > 0), _probability(before, after, variance), inside)
 
 
 def _crossing_time(before: Tensor, after: Tensor, variance: Tensor, uniform: Tensor, normal: Tensor) -> Tensor:

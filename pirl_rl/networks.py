@@ -38,8 +38,8 @@ class Actor(nn.Module):
         levels: whether the levels of the constraints of A and B are inputs too, see `Levels`.
         choices: None makes each coordinate of the control a hyperbolic tangent. With an integer of at least 2 it is one
             of so many numbers evenly spaced over [-1, 1], bounds included, each of which has a score, see `Choice`. The
-            control may then jump between two of them along a surface, where a tangent has to pass through all between
-            them. It has no gradient, so that only `BestControl` can train it.
+            control may then jump between two of them along a surface, where a hyperbolic tangent has to pass through
+            all between them. It has no gradient, so that only `BestControl` can train it.
         together: the number of coordinates of the control that are chosen together, with one score for each combination
             of their numbers. Where the best control changes in several coordinates at once, they then jump along the
             same surface.

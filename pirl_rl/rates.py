@@ -1,4 +1,4 @@
-"""The rates of a problem, measured at sampled states and controls: across its box, across its sets, and of its drift.
+"""The rates of a problem, measured at sampled states and controls: across its box and sets, of drift and of control.
 
 Across a length L the drift f moves a path by |f| t in a time t, and the noise by |sigma| sqrt(t). For a coordinate, L
 is the width of the box. For a constraint g of A or B, which is -D where the set is deepest, the drift gives
@@ -26,6 +26,9 @@ DIFFERENCE = 1e-6
 
 JACOBIANS = 256
 """The number of states at which the Jacobian is taken."""
+
+CONTROLS = 16
+"""The number of controls over which the range of the drift is taken at each state."""
 
 
 class Move(NamedTuple):
@@ -84,6 +87,28 @@ def fastest_rate(problem: ReachAvoidProblem, x: Tensor, u: Tensor) -> float:
     jacobian = torch.stack(columns, -1)
     finite = jacobian.isfinite().flatten(1).all(-1)
     return torch.linalg.eigvals(jacobian[finite]).abs().amax(-1).median().item() if finite.any() else float("nan")
+
+
+def control_rate(problem: ReachAvoidProblem, x: Tensor, u: Tensor) -> float:
+    """How fast the noise makes a held control wrong, in 1/s^2: a s^2, the largest over the coordinates of the state.
+
+    Here a is half the range of the drift over the controls and s the noise, in widths of the box per s and per sqrt(s).
+    Beside a surface where the best control jumps, the noise carries a path by s sqrt(dt) across it while the control is
+    held for dt. The path is there for a share of the time that is proportional to s sqrt(dt), and V loses there at a
+    rate that is proportional to a s sqrt(dt), since the gradient of V along the control is 0 at the surface. So holding
+    the control for dt costs success in proportion to a s^2 dt times the horizon.
+
+    Args:
+        problem: the physics.
+        x: states (N, n).
+        u: physical controls (N, m).
+    """
+    width = 2 * problem.states.center_and_half_width(x)[1]
+    controls = [u.roll(shift, 0) for shift in range(min(CONTROLS, len(u)))]
+    drift = torch.stack([problem.drift(x, held) for held in controls]) / width
+    noise = torch.stack([problem.diffusion(x, held).square().sum(-1) for held in controls]).mean(0) / width**2
+    reach = (drift.amax(0) - drift.amin(0)) / 2
+    return (reach * noise).amax(-1).median().item()
 
 
 def _part(constraints: Callable[[Tensor], Tensor], index: int) -> Callable[[Tensor], Tensor]:

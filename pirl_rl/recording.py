@@ -1,7 +1,7 @@
 """Work on a CUDA device that is recorded as one graph of kernels and replayed by one launch.
 
 The networks of this package are small. A GPU computes a kernel of an update in a few microseconds, and Python takes
-longer to launch it, so that launches are nearly all of the time. A recorded graph has them behind it.
+longer to launch it, so that launches are nearly all of the time. A recorded CUDA graph is replayed by one launch.
 
 What is recorded must ask nothing of the device: no number may come back from it, and no number may go to it that
 changes from one replay to the next. All that changes lies in tensors whose memory stays where it is.

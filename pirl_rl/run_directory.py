@@ -101,9 +101,13 @@ class RunDirectory:
         return self.path / self.HOLDER
 
     def unused(self) -> bool:
-        """Whether the directory has nothing but what a run leaves that was killed before it had a configuration."""
-        others = [path for path in self.path.iterdir() if path.name != self.CONFIG.parent.name]
-        return not others and not self.config.exists()
+        """Whether the directory has nothing but what a run leaves that was killed before it had a configuration.
+
+        These are folders without files, and the lock.
+        """
+        own = self.path / self.CONFIG.parent
+        files = (path for path in self.path.rglob("*") if path.is_symlink() or not path.is_dir())
+        return not self.config.exists() and all(own in path.parents for path in files)
 
     @property
     def metrics(self) -> Path:

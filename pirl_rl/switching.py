@@ -70,13 +70,14 @@ def control_levels(problem: ReachAvoidProblem) -> int:
 
 
 def actor_choices(problem: ReachAvoidProblem) -> int | None:
-    """The number of levels among which an actor chooses for each coordinate of the control, or None for a tangent.
+    """The number of levels among which an actor chooses for each coordinate of the control, or None for a tanh output.
 
     An actor chooses where the Hamiltonian is not affine in u, so that it jumps over controls that are worse than those
-    on both sides. It does not where sigma depends on u and the best control often lies between the bounds. There V is
-    nearly straight where the policy makes strong noise, and bends where it makes weak noise, and the best control in
-    turn depends on how V bends. So the best control at a state changes many times in a training. An actor that chooses
-    ends at one of these controls, and a tangent at their mean, which is better where the Hamiltonian is concave in u.
+    on both sides. The exception is a sigma that depends on u where the best control often lies between the bounds.
+    There V is nearly straight where the policy makes strong noise, and bends where it makes weak noise, and the best
+    control in turn depends on how V bends. So the best control at a state changes many times in a training. An actor
+    that chooses ends at one of these controls. A tanh output ends at their mean, which is better where the Hamiltonian
+    is concave in u.
 
     Args:
         problem: the physics.

@@ -80,7 +80,8 @@ class TemporalDifferences:
         with torch.no_grad():
             values = networks.target_critic(following["tau"], following["state"], action)
             value = values.amin(0) if self.target_critics == "min" else values.mean(0)
-            target = following["reward"] + (~following["terminated"]) * value
+            # A path may have ended where V has no number.
+            target = following["reward"] + torch.where(following["terminated"], 0.0, value)
         inputs = replay["tau"], replay["state"], replay["action"]
         if self.criterion == "squares":
             error = (networks.critic(*inputs) - target).square()

@@ -1,8 +1,9 @@
 """Control interval and integration steps of a problem, chosen from its own rates, see `pirl_rl.rates`.
 
 A control is held during a control step, so that in one step a path should neither cross much of the box of states nor
-pass through a set. The control step is the longest for which the moves of drift and noise are below the shares that
-stand here. Within it the drift is integrated in sub-steps. They resolve its fastest rate, and they are halved until a
+pass through a set, nor should the noise carry it far across a surface where the best control jumps. The control step is
+the longest for which the moves of drift and noise, and what holding the control costs, are below the bounds that stand
+here. Within it the drift is integrated in sub-steps. They resolve its fastest rate, and they are halved until a
 control step without noise is that of ten times as many.
 """
 
@@ -15,14 +16,23 @@ from torch import Tensor
 
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.rates import Move, across_box, across_sets, fastest_rate
+from pirl_rl.rates import Move, across_box, across_sets, control_rate, fastest_rate
 from pirl_rl.simulator import Crossing, Simulator
 
 SHARES = {"the box": (0.05, 0.1), "the target": (0.5, 0.5), "the avoid set": (0.5, 0.5)}
 """The largest moves of drift and noise in one control step, in widths of the box and depths of the sets."""
 
 STEPS = (400, 500, 600, 800)
-"""The numbers of control steps in the horizon from which one is taken."""
+"""The numbers of control steps in the horizon from which one is taken where moves across box and sets limit it."""
+
+HELD = 3.5e-3
+"""The largest `control_rate`, times control step and horizon, that is accepted."""
+
+SHORT_STEPS = (800, 1_600)
+"""The numbers of control steps in the horizon from which one is taken where holding the control limits it."""
+
+FEW_STATES = 2
+"""The largest number of states with which holding the control limits the step, see docs/recipe.md."""
 
 TOLERANCE = 1e-3
 """The largest error of a control step without noise, in widths of the box, that is accepted."""
@@ -30,8 +40,11 @@ TOLERANCE = 1e-3
 COVERED = 0.95
 """The share of the sampled states at which the error is below the tolerance."""
 
-LEAST_SUBSTEPS, MOST_SUBSTEPS = 2, 256
-"""The range of the number of sub-steps that are proposed. A single sub-step biases V near corners of the sets."""
+LEAST_STEPS, MOST_SUBSTEPS = 1_600, 256
+"""A control step has 2 integration steps at least, up to fewer control steps than the first number, and then 1.
+
+Longer integration steps bias V near corners of the sets. The second number is the largest one that is proposed.
+"""
 
 
 class TimeSteps(NamedTuple):
@@ -78,7 +91,11 @@ def propose_time_steps(
     check_time_steps(problem, dt, substeps, crossing)
     x, u = _samples(problem, samples, seed)
     moves, rate = [across_box(problem, x, u), *across_sets(problem, x, u)], fastest_rate(problem, x, u)
-    chosen, limit = _control_step(problem.horizon, moves) if dt is None else (dt, "")
+    if dt is None:
+        held = control_rate(problem, x, u) if problem.states.dim <= FEW_STATES else 0.0
+        chosen, limit = _control_step(problem.horizon, moves, held)
+    else:
+        chosen, limit = dt, ""
     count = _substeps(problem, chosen, crossing, rate, x, u) if substeps is None else substeps
     error = _error(problem, chosen, count, crossing, x, u)
     plural = "s" if count > 1 else ""
@@ -121,11 +138,15 @@ def _longest(move: Move) -> float:
     return min(by_drift, (noise / move.spread) ** 2) if move.spread > 0 else by_drift
 
 
-def _control_step(horizon: float, moves: list[Move]) -> tuple[float, str]:
-    """The longest control step that the moves allow, with a number of steps out of `STEPS`, and what limits it."""
+def _control_step(horizon: float, moves: list[Move], held: float) -> tuple[float, str]:
+    """The longest control step that the moves and the `control_rate` allow, and what limits it."""
     slowest = min(moves, key=_longest)
     wanted, across = _longest(slowest), slowest.across
     steps = next((steps for steps in STEPS if horizon / steps <= wanted), STEPS[-1])
+    asked = held * horizon**2 / HELD  # the number of control steps that holding the control asks for
+    if asked > steps:
+        steps = next((short for short in SHORT_STEPS if short >= asked), SHORT_STEPS[-1])
+        return horizon / steps, "A control that is held for longer reacts too late to the noise."
     if steps == STEPS[0]:
         limit = ""
     elif horizon / steps <= wanted:
@@ -137,7 +158,7 @@ def _control_step(horizon: float, moves: list[Move]) -> tuple[float, str]:
 
 def _substeps(problem: ReachAvoidProblem, dt: float, crossing: Crossing, rate: float, x: Tensor, u: Tensor) -> int:
     """The smallest power of two that resolves the fastest rate and whose error is accepted."""
-    count = LEAST_SUBSTEPS
+    count = 1 if problem.horizon >= LEAST_STEPS * dt * (1 - 1e-9) else 2
     while count < min(dt * rate, MOST_SUBSTEPS):
         count *= 2
     while count < MOST_SUBSTEPS and not _error(problem, dt, count, crossing, x, u) <= TOLERANCE:

@@ -189,7 +189,8 @@ class Trainer:
 
     def begin(self) -> None:
         """Prepare the first update: enter its stage, judge the networks as they are, and play the warm-up."""
-        self._enter_stage()
+        if self.update == 0 or not self.curriculum.is_first(self.update):
+            self._enter_stage()  # else its first update does, after a checkpoint at the end of the stage before
         if self.rollback is not None and self.rollback.good_at is None:
             self.rollback.judge(self.update)
         announce("playing the first transitions")

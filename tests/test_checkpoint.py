@@ -17,6 +17,7 @@ from small import resumed, small_trainer
 from pirl_rl import load_run
 from pirl_rl.checkpoint import load, restore_rng, save
 from pirl_rl.errors import CheckpointError
+from pirl_rl.files import ABANDONED, replacing
 from pirl_rl.run_directory import RunDirectory
 
 STATE = {"loss": {"weight": torch.arange(1000.0)}, "update": 3, "rng": torch.get_rng_state(), "names": ("a", 1, None)}
@@ -118,12 +119,36 @@ def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == [RunDirectory.LAST.name]
 
 
-def test_a_link_under_the_drafts_name_is_not_followed(tmp_path):
+def test_a_link_under_the_drafts_name_is_not_followed(tmp_path, monkeypatch):
+    monkeypatch.setattr("pirl_rl.files.secrets.token_hex", lambda count: "known")
     precious = tmp_path / "precious"
     precious.write_text("mine")
-    (tmp_path / f".{RunDirectory.LAST.name}.draft").symlink_to(precious)
-    save(STATE, tmp_path / RunDirectory.LAST.name)
+    (tmp_path / f".{RunDirectory.LAST.name}.known.draft").symlink_to(precious)
+    with pytest.raises(FileExistsError):
+        save(STATE, tmp_path / RunDirectory.LAST.name)
     assert precious.read_text() == "mine"
+
+
+def test_two_writers_of_one_file_do_not_meet(tmp_path):
+    path = tmp_path / "table.md"
+    with replacing(path) as one:
+        one.write("first half, ")
+        with replacing(path) as other:
+            other.write("other")
+        assert path.read_text() == "other"
+        one.write("second half")
+    assert path.read_text() == "first half, second half"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["table.md"]
+
+
+def test_drafts_of_writers_that_were_killed_are_removed(tmp_path):
+    path, old, young = (tmp_path / name for name in ("table.md", ".table.md.1.draft", ".table.md.2.draft"))
+    for draft, age in ((old, 2 * ABANDONED), (young, 1)):
+        draft.touch()
+        os.utime(draft, (time.time() - age,) * 2)
+    with replacing(path) as file:
+        file.write("whole")
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == [young.name, path.name]
 
 
 def test_generators_go_on_and_another_device_s_begins_anew():

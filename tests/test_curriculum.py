@@ -112,7 +112,9 @@ POLICY = (
 
 
 @pytest.mark.parametrize(
-    ("stages", "stop", "end"), [(STAGES, 3, 10), (STAGES, 7, 10), (POLICY, 6, 12)], ids=["own", "run", "noise"]
+    ("stages", "stop", "end"),
+    [(STAGES, 3, 10), (STAGES, 7, 10), (POLICY, 6, 12), ((*POLICY, "trainer.checkpoint_every=3"), 3, 12)],
+    ids=["own", "run", "noise", "noise begins"],
 )
 def test_resume_inside_a_stage_is_exact(stages, stop, end, tmp_path):
     small_trainer(tmp_path / "whole", *stages).train()

@@ -7,7 +7,8 @@ import json
 import pytest
 from small import small_trainer
 
-from pirl_rl import evaluate
+from pirl_rl import evaluate, load_run
+from pirl_rl.errors import ConfigError
 from pirl_rl.run_directory import RunDirectory
 
 FIGURES = {"training.png", "surface.png", "value.png", "policy.png"}
@@ -81,3 +82,17 @@ def test_mistakes_are_named(arguments, told, run, capsys):
 def test_help_is_the_docstring(capsys):
     evaluate.main(["--help"])
     assert "python -m pirl_rl.evaluate run=RUN_DIR" in capsys.readouterr().out
+
+
+def test_a_changed_problem_is_the_one_that_is_measured(run, capsys):
+    """Within a tenth of the horizon hardly any path reaches the target."""
+    folder, summary = run
+    evaluate.main([f"run={folder}", "evaluation.final=[success]", "env.problem.horizon=0.2", "report=false"])
+    assert json.loads((folder / "evaluation.json").read_text())["success_rate"] < summary["success_rate"] / 2
+    with pytest.raises(SystemExit):
+        evaluate.main([f"run={folder}", "actor.hidden=[7]"])
+    assert "actor.hidden=[7]: expected a setting of another group" in capsys.readouterr().err
+    opened = load_run(folder)
+    for typed in ({"env.problem.horizon": 0.2}, {"critic.hidden": [7]}):
+        with pytest.raises(ConfigError, match=r"load_run\(folder, problem=...\) opens it with another problem"):
+            evaluate(opened, **typed)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from small import small_trainer
 
-from pirl_rl import load_run
+from pirl_rl import load_run, train
 from pirl_rl.commands.export import export, main
 from pirl_rl.configuration import load_config, save_config
 from pirl_rl.errors import ConfigError
@@ -63,3 +63,12 @@ def test_the_command_says_what_it_expects(arguments, capsys):
 def test_help_is_the_docstring(capsys):
     main(["--help"])
     assert "python -m pirl_rl.export run=RUN_DIR out=FOLDER" in capsys.readouterr().out
+
+
+def test_an_export_is_not_trained_from_the_beginning(run, tmp_path, in_process):
+    export(run, tmp_path / "model")
+    before = {path: path.read_bytes() for path in (tmp_path / "model").rglob("*") if path.is_file()}
+    code, text = in_process(train)(f"resume={tmp_path / 'model'}")
+    assert code == 1
+    assert f"start={tmp_path / 'model'} begins another run" in text
+    assert {path: path.read_bytes() for path in before} == before

@@ -717,3 +717,49 @@ def test_a_drift_without_a_value_in_a_set_is_not_asked_there():
         assert value.isfinite().all()
         assert (value.diff() > -1e-3).all()
         assert (value[x[:, 0] < 1.2] < 0.01).all() if tau == 0.5 else (value[x[:, 0] > 1.2] > 0.99).all()
+
+
+class Along(ReachAvoidProblem):
+    """Motion along the face of the target, with noise across it that is weak beside the mesh."""
+
+    states, controls = Box([-1.0, -1.0], [1.0, 1.0]), Box([0.0], [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.cat([torch.ones_like(u), 0.01 * u], -1)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return x.new_tensor([[0.0], [0.01]]).expand(*x.shape, 1)
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return 0.49 - x[..., 1]
+
+
+@pytest.mark.parametrize("tau", [0.0, 0.01, 0.5])
+def test_a_path_that_runs_out_of_time_beside_a_face_has_its_payoff(tau):
+    """V at a fifth to four fifths of a cell before the face is the first passage of Brownian motion with drift."""
+    problem = Along(horizon=1.0)
+    solution = GridSolver(problem, points=41, estimate=False).solve()
+    assert solution.split
+    distance = 0.05 * torch.tensor([0.2, 0.4, 0.6, 0.8], dtype=torch.float64)
+    x = torch.stack([torch.full_like(distance, -0.5), 0.49 - distance], -1)
+    exact = first_passage(torch.full_like(distance, tau), distance, 0.01, 0.01) if tau else torch.zeros_like(distance)
+    assert (solution.value(torch.full_like(distance, tau), x) - exact).abs().max() < 0.03
+
+
+def test_a_margin_does_not_lengthen_a_period():
+    class Turning(ReachAvoidProblem):
+        states, controls = Box([-math.pi], [math.pi], periodic=[0]), Box([-1.0], [1.0])
+
+        def drift(self, x: Tensor, u: Tensor) -> Tensor:
+            return u
+
+        def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+            return (0.5 + 0 * x).unsqueeze(-1)
+
+        def target_level(self, x: Tensor) -> Tensor:
+            return math.pi - 0.5 - x[..., 0].abs()  # the half turn
+
+    problem, x = Turning(horizon=1.0), torch.linspace(-3, 3, 9, dtype=torch.float64).unsqueeze(-1)
+    tau = torch.ones(len(x), dtype=torch.float64)
+    plain, wide = (GridSolver(problem, 81, margin=margin).solve().value(tau, x) for margin in (None, [0.3]))
+    assert torch.equal(plain, wide)

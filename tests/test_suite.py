@@ -221,3 +221,26 @@ def test_alternatives_stand_in_the_table_and_are_kept(tmp_path, capsys, monkeypa
 def test_a_figure_of_problems_without_a_truth():
     score = Score(*[math.nan] * 3, 0.5, math.nan, 0.01, math.nan, 0.02, 0.01, 60.0, 12_000)
     assert len(draw_suite({"cartpole": [asdict(score)]}).axes) == 4
+
+
+def test_files_in_the_place_of_a_run_stay(tmp_path, capsys):
+    mine = tmp_path / "exit1d" / "0" / "thesis.txt"
+    mine.parent.mkdir(parents=True)
+    mine.write_text("mine")
+    with pytest.raises(SystemExit):
+        main([*SMALL, "seeds=[0]", f"out={tmp_path}"])
+    assert "expected an empty directory" in capsys.readouterr().err
+    assert mine.read_text() == "mine"
+
+
+def test_a_foreign_run_imports_nothing_that_the_command_does_not_trust(tmp_path, capsys):
+    main([*SMALL, "seeds=[0]", f"out={tmp_path}", "trainer.updates=2"])
+    config = tmp_path / "exit1d" / "0" / ".hydra" / "config.yaml"
+    text = config.read_text()
+    assert "pirl_rl.problems.Exit1D" in text
+    text = text.replace("pirl_rl.problems.Exit1D", "subprocess.getoutput")
+    config.write_text(re.sub(r"(?m)^trust:.*$", "trust: [subprocess]", text))
+    next(config.parent.parent.glob("score-*.json")).unlink()
+    with pytest.raises(SystemExit):
+        main([*SMALL, "seeds=[0]", f"out={tmp_path}", "trainer.updates=2"])
+    assert "subprocess.getoutput is outside pirl_rl" in capsys.readouterr().err

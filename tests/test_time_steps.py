@@ -7,16 +7,16 @@ import torch
 from torch import Tensor
 
 from pirl_rl.assembly import make_evaluation_simulator, make_problem, make_trainer
-from pirl_rl.automatic import choose_paths, choose_time_steps, choose_updates
+from pirl_rl.automatic import choose_paths, choose_playing, choose_time_steps, choose_updates
 from pirl_rl.commands.composition import compose
 from pirl_rl.configuration import load_config, save_config
 from pirl_rl.errors import ArgumentError, ConfigError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems import Reach1D, Safety1D
-from pirl_rl.rates import across_box, across_sets, fastest_rate
+from pirl_rl.rates import across_box, across_sets, control_rate, fastest_rate
 from pirl_rl.sets import Box
 from pirl_rl.simulator import Simulator
-from pirl_rl.time_steps import STEPS, TOLERANCE, propose_time_steps
+from pirl_rl.time_steps import HELD, STEPS, TOLERANCE, propose_time_steps
 
 
 class Linear(ReachAvoidProblem):
@@ -131,6 +131,56 @@ def test_a_thin_target_is_found_by_descent(center, kind):
     assert not problem.reached(x).any()
     (move,) = across_sets(problem, x, u)
     assert move.spread == pytest.approx(0.1 / 0.02, rel=0.1)
+
+
+class Driven(Linear):
+    """The control drives the first of two coordinates, and the noise the second, or both."""
+
+    def __init__(self, noise: tuple[float, float], speed: float):
+        super().__init__([0.0, 0.0], horizon=1.0)
+        self.both, self.speed = torch.tensor(noise, dtype=torch.float64), speed
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.cat([self.speed * u, 0 * u], -1)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.diag_embed(self.both.to(x).expand_as(x))
+
+
+@pytest.mark.parametrize(("noise", "rate"), [((2.0, 0.0), 1.0), ((2.0, 9.0), 1.0), ((0.0, 2.0), 0.0)])
+def test_the_control_rate_has_drift_and_noise_of_one_coordinate(noise, rate):
+    """A speed of at most 2 and a noise of 2 in a box of the width 2: 1 times 1 squared."""
+    problem = Driven(noise, 2.0)
+    x, u = sampled(problem)
+    u[::2] = u[::2].sign()
+    assert control_rate(problem, x, u) == pytest.approx(rate)
+
+
+@pytest.mark.parametrize(("speed", "steps"), [(0.9, 400), (1.1, 800), (1.9, 800), (2.1, 1_600), (9.0, 1_600)])
+def test_noise_that_meets_a_strong_control_asks_for_short_steps(speed, steps):
+    """A noise of 1.7 moves a tenth of the box in 1/72 s, so that the control alone limits the step."""
+    limit = HELD * 400 / (1.7**2 / 4) * 2
+    found = propose_time_steps(Driven((1.7, 0.0), speed * limit))
+    assert found.dt == pytest.approx(1 / steps)
+    assert found.substeps == (1 if steps == 1_600 else 2)
+    assert ("reacts too late" in found.reason) == (steps > 400)
+
+
+def test_with_many_states_control_steps_stay_long():
+    class Many(Driven):
+        def __init__(self):
+            super().__init__((1.7, 0.0), 9.0)
+            self.states = Box([-1.0] * 4, [1.0] * 4)
+
+        def drift(self, x: Tensor, u: Tensor) -> Tensor:
+            return torch.cat([self.speed * u, 0 * x[..., 1:]], -1)
+
+        def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+            return (1.7 * torch.eye(4).to(x)).expand(*x.shape, 4)
+
+    problem = Many()
+    assert control_rate(problem, *sampled(problem)) > 100 * HELD
+    assert propose_time_steps(problem).dt == 1 / 400
 
 
 def test_a_slow_system_has_the_longest_steps():
@@ -248,6 +298,24 @@ def test_a_number_beside_auto_is_kept(capsys):
     assert capsys.readouterr().out == ""
     with pytest.raises(ConfigError, match=r"env\.dt: expected float, got 'soon'"):
         choose_time_steps(own("env.dt=soon"), Safety1D())
+
+
+@pytest.mark.parametrize(
+    ("typed", "numbers"),
+    [
+        ([], (2_048, 10, 20)),
+        (["env.dt=0.0025"], (1_024, 20, 40)),
+        (["env.dt=0.00125"], (512, 40, 80)),
+        (["env.dt=0.3"], (2_048, 10, 20)),
+        (["env.dt=0.00125", "pirl.n_steps=4", "env.num_envs=64"], (64, 4, 8)),
+    ],
+)
+def test_paths_advance_as_far_between_updates_with_short_control_steps(typed, numbers):
+    config = own(*typed)
+    choose_time_steps(config, Safety1D())
+    choose_playing(config, Safety1D())
+    assert (config.env.num_envs, config.collector.n_steps, config.stages[1].n_steps) == numbers
+    assert config.collector.frames_per_batch % config.env.num_envs == 0
 
 
 @pytest.mark.parametrize(

@@ -158,6 +158,25 @@ def test_mistakes_are_named_and_leave_nothing(arguments, told, cli, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
 
+@pytest.mark.parametrize("folder", ["run", "runs/deep/run"])
+def test_a_mistake_does_not_remove_the_current_directory(folder, cli, tmp_path):
+    code, text = cli(*QUICK, f"hydra.run.dir={folder}", "trainer.updates=-1")
+    assert code == 1
+    assert "trainer.updates" in text
+    assert tmp_path.is_dir()
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_mistake_leaves_folders_elsewhere(cli, tmp_path_factory):
+    """The run's own folder goes, and an empty one above it that is not below the current directory stays."""
+    mine = tmp_path_factory.mktemp("elsewhere") / "mine"
+    mine.mkdir()
+    code, _ = cli(*QUICK, f"hydra.run.dir={mine / 'run'}", "trainer.updates=-1")
+    assert code == 1
+    assert mine.is_dir()
+    assert not [*mine.iterdir()]
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [

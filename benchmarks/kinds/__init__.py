@@ -3,6 +3,7 @@
 from benchmarks.kinds.approaches import Chain, Pursuit, Rendezvous, Unicycle
 from benchmarks.kinds.compartments import Anaesthesia, LotkaVolterra, Rooms
 from benchmarks.kinds.cycles import JetLag, PowerSwing, Runaway, Searchlight
+from benchmarks.kinds.demands import Backburn, ChemoWard, IslandGrid, VaccineStock
 from benchmarks.kinds.masses import Crosswind, Gusty, Lander, Orbit, Servo, Sprint, VanDerPol
 from benchmarks.kinds.mixtures import Bearing, Mirror, Mixture
 from benchmarks.kinds.passages import FastRiver, Glider, SlotChange, TwoLink
@@ -19,5 +20,6 @@ KINDS += (VanDerPol, TwoHarbours, River, Loiter, Crosswind, Bicycle, Tokens, Lan
 KINDS += (Investor, Runaway, JetLag, Searchlight, PowerSwing, Forager, Ferment, FastCharge, SlotChange, TwoLink)
 KINDS += (Bearing, Mirror, Duffing, MountainCar, Swingup, Pursuit, Rooms, Anaesthesia)
 KINDS += (LotkaVolterra, Chain, Unicycle, Rendezvous, FastRiver, Glider, Reactor, Fishery)
+KINDS += (VaccineStock, Backburn, ChemoWard, IslandGrid)
 
 PROBLEMS = {kind.__name__: kind for kind in KINDS}

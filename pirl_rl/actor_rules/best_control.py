@@ -169,7 +169,7 @@ class BestControl(ActorRule):
             tried = groups if len(blocks) > 1 else None
             action, found = improved(objective, action, levels, inertia, stride, tried)
             order, stakes = order + groups, [*stakes, found / duration]
-        weight = torch.cat(stakes, -1)
+        weight = torch.cat(stakes, -1).nan_to_num(0.0, 0.0, 0.0)  # no control counts where the physics has no number
         if len(blocks) > 1:
             weight = torch.stack([weight[:, order.index(group)] for group in sorted(order)], -1)
         return action, weight

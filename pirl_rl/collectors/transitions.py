@@ -101,7 +101,9 @@ class ControlVariate(nn.Module):
         sigma = self.simulator.sigma(state, controls.denormalize(action), constant)
         deviation = transposed_times(sigma, slope).square().sum(-1).sqrt() * self.simulator.dt**0.5
         bound = (2 * self.limit * (v * (1 - v)).clamp(min=0).sqrt()).clamp(min=LEAST_DEVIATION)
-        return slope * (bound / torch.maximum(deviation, bound)).unsqueeze(-1)
+        slope = slope * (bound / torch.maximum(deviation, bound)).unsqueeze(-1)
+        # Where levels or sigma have no number the noise stays in the return: the slope is chosen before the step.
+        return torch.where(slope.isfinite().all(-1, keepdim=True), slope, 0.0)
 
 
 class PlayedPolicy(TensorDictModuleBase):

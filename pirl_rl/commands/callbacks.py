@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import atexit
-import contextlib
 from pathlib import Path
 from typing import Any
 
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
+
+from pirl_rl.files import remove_folder
 
 
 class TidySweep(Callback):
@@ -20,8 +21,4 @@ class TidySweep(Callback):
 
 def _remove_if_bare(folder: Path) -> None:
     if folder.is_dir() and [path.name for path in folder.iterdir()] == ["multirun.yaml"]:
-        (folder / "multirun.yaml").unlink()
-        with contextlib.suppress(OSError):
-            folder.rmdir()
-            for parent in (folder.parent, folder.parent.parent):
-                parent.rmdir()  # fails for a folder that is not empty
+        remove_folder(folder)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from pirl_rl.continuation import restore
 from pirl_rl.errors import ConfigError
 from pirl_rl.evaluation import Evidence, lines_of, meanings_of
 from pirl_rl.figures import draw_run
+from pirl_rl.files import remove_folder
 from pirl_rl.lock import locked
 from pirl_rl.machine import record_session
 from pirl_rl.problem import ReachAvoidProblem
@@ -54,6 +54,11 @@ def reopen(config: DictConfig, folder: Path, arguments: Sequence[str], trust: Se
     trainer = make_trainer(config, folder, trust)
     if RunDirectory(folder).last.exists():
         restore(trainer)
+    elif any(RunDirectory(folder).checkpoints.glob("weights-*.pt")):
+        raise ConfigError(
+            f"resume: expected {RunDirectory(folder).last}, got networks alone, as an export has them; start={folder} "
+            "begins another run with them"
+        )
     else:
         print("resume: the run has no checkpoint yet and starts again at update 0", flush=True)
         if config.get("start") is not None:
@@ -120,10 +125,7 @@ def new_directory(folder: Path) -> Iterator[None]:
         except BaseException:
             members = any(RunDirectory(path).config.exists() for path in folder.iterdir())
             if not members and not any(path.exists() for path in (run.metrics, run.checkpoints, run.grid)):
-                shutil.rmtree(folder)
-                for parent in (folder.parent, folder.parent.parent):
-                    with contextlib.suppress(OSError):
-                        parent.rmdir()  # fails for a folder that is not empty
+                remove_folder(folder)
             raise
 
 

@@ -7,7 +7,7 @@ draws its figures and its report.
 
     run           the directory of a finished run
     verbose=true  prints all metrics with their meaning
-    key=value     any setting of the run; evaluation.final lists the evaluators
+    key=value     any setting of the run but those of its networks; evaluation.final lists the evaluators
     trust         modules of your own that the run may import, such as trust=[my_module]
 
 Examples:
@@ -23,7 +23,7 @@ from pathlib import Path
 
 from omegaconf import open_dict
 
-from pirl_rl.assembly import make_evaluation_simulator, make_evaluators
+from pirl_rl.assembly import make_evaluation_simulator, make_evaluators, make_problem
 from pirl_rl.commands.console import named_modules, outcome, override, program, reported
 from pirl_rl.commands.report import draw_again
 from pirl_rl.configuration import load_config
@@ -51,10 +51,13 @@ def main(arguments: Sequence[str]) -> None:
             for name, value in (("verbose", False), ("report", True)):  # older runs have no such settings
                 config.setdefault(name, value)
         for text in overrides:
+            if text.partition(".")[0] in ("actor", "critic", "critics"):
+                raise ConfigError(f"{text}: expected a setting of another group, since the networks are trained")
             override(config, text)
         trust = [*config.trust, *named_modules(overrides)]
         evaluators = make_evaluators(config.evaluation, "final", trust)
-        solution = load_run(folder, trust, device=config.device).solution
+        problem = make_problem(config, trust) if any(text.startswith("env.problem") for text in overrides) else None
+        solution = load_run(folder, trust, device=config.device, problem=problem).solution
         run.refuse_links()
         announce(f"measuring: {', '.join(evaluators)}")
         evidence = evaluate(solution, make_evaluation_simulator(config, solution.problem), evaluators)

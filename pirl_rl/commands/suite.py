@@ -25,7 +25,6 @@ Examples:
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -39,7 +38,6 @@ from pirl_rl.assembly import make_problem
 from pirl_rl.commands.composition import compose
 from pirl_rl.commands.console import named_modules, program, reported
 from pirl_rl.commands.train import go_on, refuse_other_settings, train_new
-from pirl_rl.configuration import load_config
 from pirl_rl.errors import ConfigError
 from pirl_rl.figures import draw_suite, save_figures
 from pirl_rl.files import replacing
@@ -81,12 +79,13 @@ def main(arguments: Sequence[str]) -> None:
         folder, others = Path(options["out"]), {}
         for name in options["problems"]:
             truth = _truth(folder / name, name, overrides, options["states"])
+            trust = _trusted([*PROBLEMS[name], *overrides])
             own = [
                 _score(folder / name / str(seed), name, [*overrides, f"seed={seed}"], truth, options["rollouts"])
                 for seed in options["seeds"]
             ]
             others[name] = {
-                other: _alternative(folder / name, other, own, truth, options) for other in options["against"]
+                other: _alternative(folder / name, other, own, truth, options, trust) for other in options["against"]
             }
             scores, sources = _measured(folder, options)
             table = markdown(scores, sources, others)
@@ -197,13 +196,11 @@ def _score(folder: Path, name: str, overrides: Sequence[str], truth: Truth, roll
         print(f"{name}: {' '.join(overrides)}", flush=True)
         with reported(folder):
             if run.config.is_file():
-                go_on(folder, [], [*load_config(folder).trust, *named_modules(typed)])
+                go_on(folder, [], _trusted(typed))
             else:
-                # A run that was killed before it had a configuration has nothing to go on from.
-                shutil.rmtree(folder, ignore_errors=True)
                 train_new(compose("train", typed), folder, typed)
     summary = json.loads(run.summary.read_text(encoding="utf-8"))
-    trained = load_run(folder, trust=load_config(folder).trust)
+    trained = load_run(folder, trust=_trusted(typed))
     score = measure(
         trained.solution, trained.simulator, truth, rollouts, summary["wall_seconds"], int(summary.get("updates", 0))
     )
@@ -212,8 +209,13 @@ def _score(folder: Path, name: str, overrides: Sequence[str], truth: Truth, roll
     return score
 
 
+def _trusted(typed: Sequence[str]) -> list[str]:
+    """The modules that settings of this command allow a run to import, whatever the run's own configuration says."""
+    return [*compose("train", typed).trust, *named_modules(typed)]
+
+
 def _alternative(
-    folder: Path, other: str, scores: Sequence[Score], truth: Truth, options: dict[str, Any]
+    folder: Path, other: str, scores: Sequence[Score], truth: Truth, options: dict[str, Any], trust: Sequence[str]
 ) -> Alternative | None:
     """An alternative at the states of the truth, from its file if it is there; None where it does not suit.
 
@@ -223,7 +225,7 @@ def _alternative(
     if path.is_file() and other != "grid":
         found = json.loads(path.read_text(encoding="utf-8"))
         return None if found is None else Alternative(**found)
-    trained = load_run(folder / str(options["seeds"][0]), trust=load_config(folder / str(options["seeds"][0])).trust)
+    trained = load_run(folder / str(options["seeds"][0]), trust=trust)
     print(f"{folder.name}: {other}", flush=True)
     if other == "grid":
         alternative = race_grid(trained.problem, truth, max(score.mse for score in scores))

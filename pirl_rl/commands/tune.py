@@ -44,7 +44,7 @@ from pirl_rl.commands.start import adopt_networks
 from pirl_rl.configuration import CONF
 from pirl_rl.continuation import start_from
 from pirl_rl.errors import INTERRUPTED, ConfigError
-from pirl_rl.files import replacing
+from pirl_rl.files import remove_folder, replacing
 from pirl_rl.outer_loop.candidates import LEADING, Task, quoted, training_overrides
 from pirl_rl.outer_loop.directory import SETTINGS_FILE, check_directory, locked
 from pirl_rl.outer_loop.history import Result, tolerance
@@ -164,9 +164,7 @@ def _tidy(out: Path) -> Iterator[None]:
         yield
     finally:
         if not any(out.iterdir()):
-            for folder in (out, out.parent, out.parent.parent):
-                with contextlib.suppress(OSError):
-                    folder.rmdir()  # fails for a folder that is not empty
+            remove_folder(out)
 
 
 @contextlib.contextmanager

@@ -240,13 +240,17 @@ class GridSolution:
 
     def _between(self, tau: Tensor, x: Tensor) -> Tensor:
         """V (P,) between the nodes, extrapolated where no face is near, and continued into A and B."""
-        value = self._extrapolated(tau, x)
+        value = self._known(tau, x)
         if self.split:
             near = self.field.near_faces(x) & self.problem.interior(x)
             spacing = torch.as_tensor(self.mesh.spacing).to(x)
-            read = self.policy, self._extrapolated, self.field.near_faces
+            read = self.policy, self._known, self.field.near_faces
             value[near] = mean_beyond_faces(self.problem, spacing, *read, tau[near], x[near])
         return value
+
+    def _known(self, tau: Tensor, x: Tensor) -> Tensor:
+        """V (P,) between the nodes, and the payoff where no time is left: V jumps there at the faces of A and B."""
+        return torch.where(tau > 0, self._extrapolated(tau, x), self.problem.boundary_value(x).to(x))
 
     def _extrapolated(self, tau: Tensor, x: Tensor) -> Tensor:
         """V (P,) between the nodes, extrapolated from both solutions in the cells of the coarse one without a face."""

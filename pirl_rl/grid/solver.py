@@ -73,6 +73,7 @@ class GridSolver:
         self.margin = default_margin(problem) if margin is None else np.array(margin, float)
         if self.margin.shape != (n,) or not (self.margin >= 0).all():
             raise ArgumentError(f"margin: expected {n} numbers >= 0, got {margin}")
+        self.margin[list(problem.states.periodic)] = 0.0  # a wider period would be another circle
         self.problem, self.steps, self.levels, self.estimate = problem, steps, levels, estimate
         self.turns = turns
 

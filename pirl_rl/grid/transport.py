@@ -1,9 +1,9 @@
 """Transport of V along the flow without noise, for meshes that are coarse beside weak noise.
 
 A jump of the chain is as long as the distance h of two nodes. Where the noise sigma is so weak that h |f| > sigma^2 the
-scheme is upwind, and adds a noise of its own of the variance h |f| per unit of time. There each step of the length dt
-has three parts instead. In the first and in the last the noise acts for dt / 2, by the chain without drift. In between
-V moves along the flow,
+scheme is upwind, and adds a noise of its own of the variance h |f| per unit of time. Where h |f| > `WEAK` sigma^2 at
+most of the nodes, each step of the length dt has three parts instead (Strang splitting). In the first and in the last
+the noise acts for dt / 2, by the chain without drift. In between V moves along the flow,
 
     W(x) = max_u V(tau, x(dt; u)),   dx/dt = f(x, u),   x(0) = x,
 

@@ -34,10 +34,8 @@ class Run:
     Methods take finite states x (*, n) in SI units and times to go tau in s, a number or an array that broadcasts to
     (*), with 0 <= tau <= horizon.
 
-    Args:
-        trust: modules outside pirl_rl that the configuration may name.
-
     Attributes:
+        trust: modules outside pirl_rl that the configuration may name.
         solution: the problem and the networks, in torch; the run of a grid has a `GridSolution`.
         config: the run's configuration.
         update: number of updates after which the networks were saved.
@@ -48,7 +46,7 @@ class Run:
     """
 
     def __init__(self, solution: Solution, config: DictConfig, update: int, trust: Sequence[str] = ()):
-        self.solution, self.config, self.update, self._trust = solution, config, update, trust
+        self.solution, self.config, self.update, self.trust = solution, config, update, trust
         self.simulator = make_simulator(config, solution.problem)
         self._candidates: dict[int | None, Tensor] = {}  # of a look ahead, by the number of levels
 
@@ -205,7 +203,7 @@ class Run:
         """
         simulator = _changed(make_evaluation_simulator(self.config, self.problem), dt, substeps, crossing)
         if x is None:
-            where = LawOfStarts(make_starts(self.config, self._trust) if starts is None else starts, tau)
+            where = LawOfStarts(make_starts(self.config, self.trust) if starts is None else starts, tau)
             time = self.problem.horizon if tau is None else tau
             checked_points(self.problem, time, [self.problem.states.low], self.solution.dtype, self.solution.device)
         else:

@@ -8,8 +8,8 @@
     --out FOLDER   the folder for sweep.md and sweep.png, by default DIR
 
 Examples:
-    python -m pirl_rl.sweeps multirun/2026-01-31/12-00-00
-    python -m pirl_rl.sweeps multirun/2026-01-31/12-00-00 --metric success_rate --axes schedule.center
+    python -m pirl_rl.sweeps runs/reach1d_sweep/2026-01-31_12-00-00
+    python -m pirl_rl.sweeps runs/reach1d_sweep/2026-01-31_12-00-00 --metric success_rate --axes schedule.center
 """
 
 from __future__ import annotations
