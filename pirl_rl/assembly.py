@@ -134,7 +134,7 @@ def make_trainer(
         collocation=build(config.collocation, "collocation", trust, parts),
         boundary=build(config.boundary, "boundary", trust, parts),
         schedule=build(config.schedule, "schedule", trust),
-        stages=[_make_stage(node, f"stages[{i}]", trust, parts) for i, node in enumerate(config.stages)],
+        stages=[_make_stage(node, f"stages[{i}]", trust, learned) for i, node in enumerate(config.stages)],
         during=make_evaluators(config.evaluation, "during", trust),
         final=make_evaluators(config.evaluation, "final", trust),
         simulator=_share(make_evaluation_simulator(config, env.problem), env),

@@ -157,7 +157,9 @@ def _expect_period(problem: ReachAvoidProblem, axis: int, x: Tensor, u: Tensor) 
     }
     for what, function in functions.items():
         one, other = function(low, u), function(high, u)
-        if not torch.allclose(one, other, rtol=PERIOD_TOLERANCE, atol=PERIOD_TOLERANCE * float(one.abs().max())):
+        scale = float(one[one.isfinite()].abs().amax()) if one.isfinite().any() else 0.0
+        # The points are also beyond the other edges of the box, where the physics may have no numbers.
+        if not torch.allclose(one, other, rtol=PERIOD_TOLERANCE, atol=PERIOD_TOLERANCE * scale, equal_nan=True):
             raise ProblemError(
                 f"{type(problem).__name__}: axis {axis} of states is periodic, so its {what} must be the same at both "
                 f"ends of the period, {problem.states.low[axis]:g} and {problem.states.high[axis]:g}, got a difference "

@@ -217,3 +217,11 @@ def test_a_stage_with_a_rate_of_its_own_has_the_whole_decay_in_it(tmp_path):
 
     assert [rate[k] for k in (0, 9, 30)] == [wave(1e-3, k / 40) for k in (0, 9, 30)]
     assert [rate[k] for k in (10, 20, 29)] == [wave(0.01, (k - 10) / 20) for k in (10, 20, 29)]
+
+
+@pytest.mark.parametrize("starts", ["faces.NearFaces", "undecided.UndecidedStates"])
+def test_starts_of_a_stage_may_stand_beside_those_of_the_environment(starts, tmp_path):
+    stages = f"stages=[{{share: 1, initial_states: {{_target_: pirl_rl.sampling.{starts}}}}}]"
+    trainer = small_trainer(tmp_path, stages, "trainer.updates=2")
+    trainer.train()
+    assert type(trainer.collector.initial_states).__name__ == starts.partition(".")[2]

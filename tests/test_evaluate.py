@@ -96,3 +96,14 @@ def test_a_changed_problem_is_the_one_that_is_measured(run, capsys):
     for typed in ({"env.problem.horizon": 0.2}, {"critic.hidden": [7]}):
         with pytest.raises(ConfigError, match=r"load_run\(folder, problem=...\) opens it with another problem"):
             evaluate(opened, **typed)
+
+
+def test_ctrl_c_ends_the_command_with_its_exit_code(run, monkeypatch, capsys):
+    def interrupted(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pirl_rl.commands.evaluate.evaluate", interrupted)
+    with pytest.raises(SystemExit) as stop:
+        evaluate.main([f"run={run[0]}"])
+    assert stop.value.code == 130
+    assert capsys.readouterr().err.endswith("stopped\n")

@@ -10,6 +10,7 @@ import torch
 from oracles import Circle, Winding, random_solution
 from tensordict import TensorDict
 
+from pirl_rl import ReachAvoidProblem
 from pirl_rl.errors import ProblemError
 from pirl_rl.evaluation import ExactError, Rollouts, Slices
 from pirl_rl.evaluation.reference_states import ReferenceStates, displaced
@@ -152,3 +153,21 @@ def test_one_dimensional_maps_cover_the_period():
     assert np.isfinite(grid.exact).all()
     metrics = ExactError(5, 9)(random_solution(Circle(), torch.float32), Simulator(Circle())).metrics()
     assert all(math.isfinite(value) for value in metrics.values())
+
+
+def test_physics_without_numbers_beyond_another_edge_has_a_period():
+    class Polar(ReachAvoidProblem):
+        """A drift with the logarithm of the radius, which has no number at negative radii."""
+
+        states, controls = Box([0.1, -math.pi], [2.0, math.pi], periodic=[1]), Box([-1.0], [1.0])
+
+        def drift(self, x, u):
+            return torch.cat([0.5 * u - 0.1 * x[..., :1].log(), x[..., 1:].sin()], -1)
+
+        def diffusion(self, x, u):
+            return torch.diag_embed(0 * x + 0.3)
+
+        def target_level(self, x):
+            return 1.6 - x[..., 0]
+
+    check_problem(Polar(horizon=2.0))

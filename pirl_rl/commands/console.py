@@ -39,7 +39,7 @@ def quiet_libraries() -> None:
 def program(function: Callable[[Sequence[str]], None]) -> Callable[..., None]:
     """Make a command of a function of its arguments, with the help that the docstring of its module is.
 
-    Without arguments the command takes those of the command line.
+    Without arguments the command takes those of the command line. Ctrl-C ends it with the exit code `INTERRUPTED`.
     """
 
     @functools.wraps(function)
@@ -48,7 +48,11 @@ def program(function: Callable[[Sequence[str]], None]) -> Callable[..., None]:
         if helped(given, sys.modules[function.__module__].__doc__):
             return
         quiet_libraries()
-        function(given)
+        try:
+            function(given)
+        except KeyboardInterrupt:
+            print("stopped", file=sys.stderr)
+            raise SystemExit(INTERRUPTED) from None
 
     return main
 
