@@ -60,7 +60,7 @@ class Measures:
 
     Attributes:
         success: of the policy.
-        low, high: the 95% interval of `success`.
+        low, high: the 95% interval of `success` at these states, over the noise of paths and not over other states.
         random: success of random controls.
         constant: success of the best constant control.
         constant_control: that control, in SI units.
@@ -186,7 +186,7 @@ def describe(m: Measures, reasons: list[Reason]) -> list[str]:
     if len(reasons) > 1:
         lines.append(f"          {' '.join(reason.why for reason in reasons[1:])}")
     ahead = "" if m.ahead is None else f", one step of look-ahead {m.success + m.ahead.mean:.3f}"
-    lines.append(f"success   {m.success:.3f} of the policy, 95% interval {m.low:.3f} to {m.high:.3f}")
+    lines.append(f"success   {m.success:.3f} of the policy, 95% interval {m.low:.3f} to {m.high:.3f} at these states")
     lines.append(
         f"beside    random controls {m.random:.3f}, the best constant one, {_numbers(m.constant_control)}, "
         f"{m.constant:.3f}{ahead}"
