@@ -13,7 +13,7 @@ from typing import Any, overload
 
 from pirl_rl.assembly import make_evaluation_simulator, make_evaluators
 from pirl_rl.checking import check
-from pirl_rl.commands.console import named_modules, override, quiet_libraries
+from pirl_rl.commands.console import TRAINED, named_modules, override, quiet_libraries
 from pirl_rl.commands.population import member_names
 from pirl_rl.commands.settings import compose_run, run_folder, typed_settings
 from pirl_rl.commands.train import train_new
@@ -147,7 +147,7 @@ def evaluate(run: Run | str | PathLike[str], *, trust: Sequence[str] = (), **set
     config = copy.deepcopy(run.config)
     typed = typed_settings(settings, config, "evaluation")
     for text in typed:
-        if text.partition(".")[0] in ("actor", "critic", "critics") or text.startswith("env.problem"):
+        if text.partition(".")[0] in TRAINED or text.startswith("env.problem"):
             raise ConfigError(
                 f"{text}: expected a setting of evaluation or of env, since problem and networks are those of the run; "
                 "load_run(folder, problem=...) opens it with another problem"

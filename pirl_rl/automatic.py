@@ -13,7 +13,7 @@ from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
 from pirl_rl.structure import check_problem, noise_channels
 from pirl_rl.switching import actor_choices, coordinates_together
-from pirl_rl.time_steps import check_time_steps, propose_time_steps
+from pirl_rl.time_steps import STEPS, check_time_steps, propose_time_steps
 
 AUTO = "auto"
 """The value that leaves a choice to the package.
@@ -34,8 +34,8 @@ BASE_COST, MOST_COST = 80, 1_700_000
 The number of updates that is chosen, times this sum, is at most MOST_COST.
 """
 
-CONTROL_STEPS, PLAYED_PATHS, RETURN_STEPS = 400, 2_048, 10
-"""The number of paths that are played, and the steps of their returns, with up to so many control steps."""
+PLAYED_PATHS, RETURN_STEPS = 2_048, 10
+"""The number of paths that are played, and the steps of their returns, with up to `STEPS[0]` control steps."""
 
 PATHS = {
     ("success", "episodes"): (10_000, 1_000),
@@ -89,7 +89,7 @@ def choose_playing(config: DictConfig, problem: ReachAvoidProblem) -> None:
     """
     steps = problem.horizon / config.env.get("dt", Simulator.dt)
     # A power of two, since the number of paths has to divide collector.frames_per_batch.
-    stretch = 2 ** round(math.log2(max(1.0, steps / CONTROL_STEPS)))
+    stretch = 2 ** round(math.log2(max(1.0, steps / STEPS[0])))
     if config.env.get("num_envs") == AUTO:
         config.env.num_envs = max(1, PLAYED_PATHS // stretch)
     # The collector may refer to the settings of the method, which a resumed run may change.

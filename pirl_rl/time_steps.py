@@ -31,7 +31,7 @@ HELD = 3.5e-3
 SHORT_STEPS = (800, 1_600)
 """The numbers of control steps in the horizon from which one is taken where holding the control limits it."""
 
-FEW_STATES = 2
+MOST_STATES = 2
 """The largest number of states with which holding the control limits the step, see docs/recipe.md."""
 
 TOLERANCE = 1e-3
@@ -92,7 +92,7 @@ def propose_time_steps(
     x, u = _samples(problem, samples, seed)
     moves, rate = [across_box(problem, x, u), *across_sets(problem, x, u)], fastest_rate(problem, x, u)
     if dt is None:
-        held = control_rate(problem, x, u) if problem.states.dim <= FEW_STATES else 0.0
+        held = control_rate(problem, x, u) if problem.states.dim <= MOST_STATES else 0.0
         chosen, limit = _control_step(problem.horizon, moves, held)
     else:
         chosen, limit = dt, ""

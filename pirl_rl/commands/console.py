@@ -57,6 +57,9 @@ def program(function: Callable[[Sequence[str]], None]) -> Callable[..., None]:
     return main
 
 
+TRAINED = ("actor", "critic", "critics")
+"""Groups of settings that cannot change in a run that is trained, since they are those of its networks."""
+
 Meanings = Mapping[str, Mapping[str, str]]
 """What metrics mean, by the group of the table to which they belong and by metric."""
 

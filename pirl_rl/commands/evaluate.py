@@ -24,7 +24,7 @@ from pathlib import Path
 from omegaconf import open_dict
 
 from pirl_rl.assembly import make_evaluation_simulator, make_evaluators, make_problem
-from pirl_rl.commands.console import named_modules, outcome, override, program, reported
+from pirl_rl.commands.console import TRAINED, named_modules, outcome, override, program, reported
 from pirl_rl.commands.report import draw_again
 from pirl_rl.configuration import load_config
 from pirl_rl.errors import ConfigError
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str]) -> None:
             for name, value in (("verbose", False), ("report", True)):  # older runs have no such settings
                 config.setdefault(name, value)
         for text in overrides:
-            if text.partition(".")[0] in ("actor", "critic", "critics"):
+            if text.partition(".")[0] in TRAINED:
                 raise ConfigError(f"{text}: expected a setting of another group, since the networks are trained")
             override(config, text)
         trust = [*config.trust, *named_modules(overrides)]
