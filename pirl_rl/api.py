@@ -11,8 +11,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, overload
 
+from pirl_rl import checking
 from pirl_rl.assembly import make_evaluation_simulator, make_evaluators
-from pirl_rl.checking import check
 from pirl_rl.commands.console import TRAINED, named_modules, override, quiet_libraries
 from pirl_rl.commands.population import member_names
 from pirl_rl.commands.settings import compose_run, run_folder, typed_settings
@@ -103,10 +103,9 @@ def _subject(subject: Any) -> tuple[str, ReachAvoidProblem | None, dict[str, str
     if isinstance(subject, str):
         return subject, None, {}, []
     if inspect.isclass(subject) and issubclass(subject, ReachAvoidProblem):
-        if missing := ", ".join(sorted(subject.__abstractmethods__)):
-            raise ArgumentError(f"problem_or_experiment: {subject.__qualname__} lacks {missing}")
+        problem = _made(subject, "problem_or_experiment")
         if not _importable(subject):
-            return "own", subject(), {}, []
+            return "own", problem, {}, []
         return "own", None, {"env.problem._target_": f"{subject.__module__}.{subject.__name__}"}, [subject.__module__]
     if isinstance(subject, ReachAvoidProblem):
         return "own", subject, {}, []
@@ -114,6 +113,17 @@ def _subject(subject: Any) -> tuple[str, ReachAvoidProblem | None, dict[str, str
         "problem_or_experiment: expected the name of an experiment, a ReachAvoidProblem or a subclass of it, got "
         f"{type(subject).__name__}"
     )
+
+
+def _made(kind: type[ReachAvoidProblem], argument: str) -> ReachAvoidProblem:
+    """An object of a class of problems.
+
+    Raises:
+        ArgumentError: the class lacks a method.
+    """
+    if missing := ", ".join(sorted(kind.__abstractmethods__)):
+        raise ArgumentError(f"{argument}: {kind.__qualname__} lacks {missing}")
+    return kind()
 
 
 def _importable(subject: type) -> bool:
@@ -124,6 +134,20 @@ def _importable(subject: type) -> bool:
         return getattr(importlib.import_module(subject.__module__), subject.__name__, None) is subject
     except ImportError:
         return False
+
+
+def check(
+    problem: ReachAvoidProblem | type[ReachAvoidProblem], dt: float | None = None, substeps: int | None = None
+) -> list[checking.Finding]:
+    """The warnings and notes about a problem, an object or a class; see `pirl_rl.checking.examine` for the arguments.
+
+    Raises:
+        ProblemError: the problem has errors; the message lists them.
+        ArgumentError: `problem` is no problem, or a time step is out of range.
+    """
+    if inspect.isclass(problem) and issubclass(problem, ReachAvoidProblem):
+        problem = _made(problem, "problem")
+    return checking.check(problem, dt, substeps)
 
 
 def evaluate(run: Run | str | PathLike[str], *, trust: Sequence[str] = (), **settings: Any) -> dict[str, float]:

@@ -2,8 +2,9 @@
 
     dX = f(X, U) dt + sigma(X, U) dW,   X in R^n, U in a box of R^m, W in R^w      Eq. (sde)
 
-V(tau, x) is the largest probability to reach A before B within the time to go tau, Eq. (exit_value). All quantities are
-in SI units. States x have shape (*, n), controls u (*, m), times to go tau and levels (*). This is the only place where
+V(tau, x) is the largest probability to reach A before B within the time to go tau, Eq. (exit_value). Quantities are in
+SI units, or in any others that fit together: where a docstring or a message says s, it means the unit of the horizon.
+States x have shape (*, n), controls u (*, m), times to go tau and levels (*). This is the only place where
 the physics is written down; networks, environments and integration are elsewhere.
 """
 
@@ -69,7 +70,11 @@ class ReachAvoidProblem(ABC):
 
     @abstractmethod
     def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
-        """sigma(x, u) (*, n, w), in units of the state per sqrt(s), with one column for each noise channel."""
+        """sigma(x, u) (*, n, w), in units of the state per sqrt(s), with one column for each noise channel.
+
+        A channel that acts on several states has several entries in its column. Where each state has noise of its own,
+        of the strengths s (*, n), this is `torch.diag_embed(s)`.
+        """
 
     def target_level(self, x: Tensor) -> Tensor:
         """The level (*) of A at states (*, n), <= 0 inside. A subclass defines this or `target_constraints`.
@@ -80,6 +85,8 @@ class ReachAvoidProblem(ABC):
 
     def target_constraints(self, x: Tensor) -> Tensor:
         """Smooth levels (*, k) at states (*, n). Their intersection is A, which may thus have corners.
+
+        Each level may have a unit of its own. For two targets `target_level` is the `torch.minimum` of their levels.
 
         Raises:
             ProblemError: the problem defines no target.
@@ -93,7 +100,7 @@ class ReachAvoidProblem(ABC):
         return self.avoid_constraints(x).amin(-1)
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
-        """Smooth levels (*, k) at states (*, n). Their union is B."""
+        """Smooth levels (*, k) at states (*, n), each in a unit of its own if wanted. Their union is B."""
         if type(self).avoid_level is ReachAvoidProblem.avoid_level:
             return x.new_full((*x.shape[:-1], 1), torch.inf)
         return self.avoid_level(x).unsqueeze(-1)

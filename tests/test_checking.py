@@ -439,6 +439,8 @@ def test_the_function_returns_warnings_and_raises_errors():
     assert warning.subject == "NoNoise.diffusion"
     with pytest.raises(pirl_rl.errors.ProblemError, match=r"EmptyTarget\.target_level"):
         pirl_rl.check(EmptyTarget())
+    with pytest.raises(pirl_rl.errors.ProblemError, match=r"EmptyTarget\.target_level"):
+        pirl_rl.check(EmptyTarget)
 
 
 def test_given_steps_are_checked():
@@ -447,8 +449,11 @@ def test_given_steps_are_checked():
 
 
 def test_the_command_prints_findings_and_ends_with_an_exit_code(capsys):
-    main(["pirl_rl.problems:HalfSpace", "dim=3"])
-    assert "HalfSpace: 0 errors, 0 warnings, 0 notes in" in capsys.readouterr().out
+    for name in ("pirl_rl.problems:HalfSpace", "pirl_rl.problems.HalfSpace"):
+        main([name, "dim=3"])
+        printed = capsys.readouterr().out
+        assert "HalfSpace: 0 errors, 0 warnings, 0 notes in" in printed
+        assert "time     Control step 0.0025 s, 400 in the horizon, with 2 integration steps." in printed
     with pytest.raises(SystemExit) as caught:
         main([f"{__name__}:FarTarget"])
     assert caught.value.code == 1
@@ -458,10 +463,12 @@ def test_the_command_prints_findings_and_ends_with_an_exit_code(capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "expected one problem"),
+        ([], "expected one argument without a sign of equality, the class of a problem"),
         (["nowhere:Problem"], "no module 'nowhere'"),
         (["pirl_rl.problems:Nothing"], "has no class 'Nothing'"),
-        (["pirl_rl.problems"], "expected my_module:MyProblem, got 'pirl_rl.problems'"),
+        (["problems"], "expected my_module:MyProblem, got 'problems'"),
+        (["pirl_rl.problems"], "expected a subclass of pirl_rl.ReachAvoidProblem"),
+        (["env.problem._target_=my_module.MyProblem"], "got env.problem._target_=my_module.MyProblem"),
         (["pirl_rl:Box"], "expected a subclass of pirl_rl.ReachAvoidProblem"),
         (["pirl_rl.problems:HalfSpace", "size=3"], "unexpected keyword argument 'size'"),
         (["pirl_rl.problems:HalfSpace", "dim=0"], "HalfSpace.dim: expected an integer >= 1"),

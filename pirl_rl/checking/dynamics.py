@@ -64,8 +64,8 @@ def noise(samples: Samples) -> Iterator[Finding]:
         yield found(problem, "warning", "diffusion", message)
     elif float(rank.max()) < n:
         message = (
-            f"the noise acts in {int(rank.max())} of {n} directions; along the others V may jump, and it need not take "
-            "the value of a set at faces that paths cannot cross."
+            f"the noise acts in {int(rank.max())} of {n} directions. Along the others V may jump, and at faces that "
+            "paths cannot cross it need not take the value of the set. There is nothing to mend if this is meant."
         )
         yield found(problem, "note", "diffusion", message)
     elif float(rank.min()) < n:

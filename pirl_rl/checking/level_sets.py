@@ -11,7 +11,7 @@ from pirl_rl.checking.findings import Finding, found
 from pirl_rl.checking.samples import Samples, defines
 from pirl_rl.descent import descended
 from pirl_rl.errors import ProblemError
-from pirl_rl.problem import RANDOM_STATES, ReachAvoidProblem
+from pirl_rl.problem import RANDOM_STATES, WIDER, ReachAvoidProblem
 from pirl_rl.sampling.initial_states import sample_interior
 
 STARTS = 64
@@ -61,13 +61,18 @@ def overlap(samples: Samples) -> Iterator[Finding]:
     if not problem.shared_constraints:
         return
     both, part = problem.overlap(), _part(samples, "target")
-    count = f"{len(both):,} of {RANDOM_STATES:,} random states"
+    inside = problem.states.contains(both)
+    shown = both[inside][0] if inside.any() else both[0]
+    count = f"{len(both):,} of {RANDOM_STATES:,} random states in a box {WIDER:g} times as wide as that of the states"
     if problem.reached(problem.random_states()).any():
-        message = f"target and avoid set overlap, at {count}; states in both count as failures, not as the target."
-        yield found(problem, "warning", part, message, both[0])
+        message = (
+            f"target and avoid set overlap, at {count}. States in both count as failures; there is nothing to mend if "
+            "this is meant."
+        )
+        yield found(problem, "warning", part, message, shown)
     else:
         message = f"expected a target outside the avoid set, got one that lies in it, with {count} in both."
-        yield found(problem, "error", part, message, both[0])
+        yield found(problem, "error", part, message, shown)
 
 
 def places(samples: Samples) -> Iterator[Finding]:

@@ -3,10 +3,12 @@
     python -m pirl_rl.check my_module:MyProblem [dt=0.01] [substeps=4] [key=value ...]
 
 Finds mistakes in the methods of a problem, its sets and its units, in seconds, and names the method, the line and a
-state at which each can be seen. Ends with exit code 1 where there is an error. Training starts with the same check,
-unless it is given check=false.
+state at which each can be seen. Without an error it also prints the time steps with which the problem would be
+simulated. Ends with exit code 1 where there is an error. Training starts with the same check, unless it is given
+check=false.
 
-    my_module:MyProblem  the class, in a module that Python finds from the current directory
+    my_module:MyProblem  the class, in a module that Python finds from the current directory; a dot in place of the
+                         colon will do, too
     dt                   the control step with which the problem will be simulated, in s; by default the proposed one
     substeps             the number of integration steps in a control step; by default the proposed number
     key=value            any other setting is an argument of the class
@@ -32,6 +34,7 @@ from pirl_rl.commands.console import program, reported
 from pirl_rl.errors import ConfigError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
+from pirl_rl.time_steps import propose_time_steps
 
 
 @program
@@ -39,17 +42,23 @@ def main(arguments: Sequence[str]) -> None:
     with reported(Path()):
         named = [text for text in arguments if "=" not in text]
         if len(named) != 1:
-            raise ConfigError(f"expected one problem, as in python -m pirl_rl.check my_module:MyProblem, got {named}")
+            raise ConfigError(
+                "expected one argument without a sign of equality, the class of a problem, as in python -m "
+                f"pirl_rl.check my_module:MyProblem, got {' '.join(arguments) or 'nothing'}"
+            )
         settings: Any = OmegaConf.to_container(OmegaConf.from_dotlist([text for text in arguments if "=" in text]))
         steps = {name: settings.pop(name) for name in ("dt", "substeps") if name in settings}
         problem = _problem(named[0], settings)
         started = time.perf_counter()
         findings = examine(problem, **steps)
+        failed = any(finding.level == "error" for finding in findings)
+        time_steps = "" if failed else propose_time_steps(problem, **steps).reason
     print(_outcome(problem, findings, time.perf_counter() - started))
     if text := report(findings):
         print(text)
-    if any(finding.level == "error" for finding in findings):
+    if failed:
         sys.exit(1)
+    print(f"time     {time_steps}")
 
 
 def check_before_training(config: DictConfig, problem: ReachAvoidProblem) -> None:
@@ -66,12 +75,12 @@ def check_before_training(config: DictConfig, problem: ReachAvoidProblem) -> Non
 
 
 def _problem(named: str, settings: dict[str, Any]) -> ReachAvoidProblem:
-    """The problem `my_module:MyProblem`, with arguments of its class.
+    """The problem `my_module:MyProblem` or `my_module.MyProblem`, with arguments of its class.
 
     Raises:
         ConfigError: there is no such module or class, or it does not take the arguments.
     """
-    module, _, name = named.partition(":")
+    module, _, name = named.rpartition(":" if ":" in named else ".")
     if not module or not name:
         raise ConfigError(f"expected my_module:MyProblem, got {named!r}")
     try:
