@@ -14,6 +14,7 @@ from typing import Any, overload
 from pirl_rl.assembly import make_evaluation_simulator, make_evaluators
 from pirl_rl.checking import check
 from pirl_rl.commands.console import TRAINED, named_modules, override, quiet_libraries
+from pirl_rl.commands.directory import own_directory
 from pirl_rl.commands.population import member_names
 from pirl_rl.commands.settings import compose_run, run_folder, typed_settings
 from pirl_rl.commands.train import train_new
@@ -84,7 +85,7 @@ def train(
         settings["trainer.seeds"] = list(seeds)
     config, typed = compose_run(experiment, {**named, **settings})
     default = run_folder(config)
-    path = Path(default if folder is None else folder).absolute()
+    path = own_directory(Path(default).absolute()) if folder is None else Path(folder).absolute()
     with warnings.catch_warnings():
         quiet_libraries()
         train_new(config, path, typed, trust, problem)

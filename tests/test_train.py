@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import os
 import signal
@@ -14,9 +15,11 @@ import torch
 from omegaconf import OmegaConf
 from small import QUICK, command
 
+import pirl_rl
 from pirl_rl import load_run, train
 from pirl_rl.commands import catalogue
 from pirl_rl.configuration import CONF, load_config
+from pirl_rl.lock import locked
 from pirl_rl.machine import read_sessions
 from pirl_rl.run_directory import RunDirectory
 
@@ -270,6 +273,32 @@ def test_a_run_is_never_overwritten(finished, cli):
     assert code == 1
     assert "no run overwrites files" in text
     assert RunDirectory(finished).config.read_bytes() == before
+
+
+def test_runs_that_begin_in_the_same_second_have_directories_of_their_own(cli, tmp_path, monkeypatch):
+    """On the command line and from Python, also where the first of them still runs; a refused one leaves nothing."""
+
+    class Stopped(datetime.datetime):
+        @classmethod
+        def now(cls, tz=None):
+            return cls(2026, 1, 31, 12)
+
+    monkeypatch.setattr("hydra.core.utils.datetime", Stopped)
+    few = (*QUICK, *SMALL, "trainer.updates=3", "report=false", "evaluation.during=[]")
+    running = tmp_path / "runs" / "reach1d" / "2026-01-31_12-00-00-0"
+    with locked(RunDirectory(running)):
+        assert cli(*few, "trainer.updates=-1")[0] == 1
+        code, text = cli(*few)
+        assert code == 0, text
+    settings = {"updates": 3, "debug": "default", "env.num_envs": 32, "report": False, "figures": False}
+    pirl_rl.train("reach1d", **settings, **{"evaluation.during": [], "evaluation.final": []})
+    assert sorted(path.name for path in running.parent.iterdir()) == [
+        running.name,
+        f"{running.name}-2",
+        f"{running.name}-3",
+    ]
+    assert not RunDirectory(running).config.exists()
+    assert [load_run(f"{running}-{number}").update for number in (2, 3)] == [3, 3]
 
 
 def test_sweep_goes_on_after_a_bad_job(cli, tmp_path):

@@ -104,6 +104,33 @@ def show_run(
     print(f"run      {run}")
 
 
+def own_directory(folder: Path) -> Path:
+    """The directory of a run whose user has named none: the one that the clock names, or another beside it.
+
+    Runs that begin in the same second have the same name. The first of them takes it, and the others take the first
+    that is free of <name>-2, <name>-3 and so on.
+
+    Args:
+        folder: the directory that the clock names, which may exist.
+
+    Returns:
+        A directory that no other run takes. It has a folder `.hydra` and no files.
+
+    Raises:
+        ConfigError: if a file lies in its place.
+    """
+    refuse_files(folder)
+    path, number = folder, 1
+    while True:
+        try:
+            # Of several processes that make one folder, the operating system lets a single one succeed.
+            (path / RunDirectory.CONFIG.parent).mkdir(parents=True)
+            return path
+        except FileExistsError:
+            number += 1
+            path = folder.with_name(f"{folder.name}-{number}")
+
+
 @contextlib.contextmanager
 def new_directory(folder: Path) -> Iterator[None]:
     """Create a run directory. It is removed if the run ends before its first row of metrics, checkpoint or grid.

@@ -36,7 +36,7 @@ from pirl_rl.commands.catalogue import choices
 from pirl_rl.commands.check import check_before_training
 from pirl_rl.commands.composition import check_overrides, drop_leftovers, register
 from pirl_rl.commands.console import named_modules, override, quiet_libraries, reported
-from pirl_rl.commands.directory import begin, new_directory, refuse_files, reopen, show
+from pirl_rl.commands.directory import begin, new_directory, own_directory, refuse_files, reopen, show
 from pirl_rl.commands.methods import check_method
 from pirl_rl.commands.population import resume_population, train_population
 from pirl_rl.commands.solve import solve
@@ -65,6 +65,9 @@ def train(config: DictConfig) -> float:
     foreign = dict.fromkeys(name for name in [*config.trust, *named_modules(overrides)] if name != PACKAGE.name)
     again = [f"trust=[{','.join(foreign)}]"] if foreign else []
     in_sweep = hydra_config.mode == RunMode.MULTIRUN
+    if not in_sweep and not _folders(hydra_config.overrides.hydra):
+        with reported(folder):
+            folder = own_directory(folder)
     with reported(folder, one_of_many=in_sweep, again=again):
         summary = (train_in_sweep if in_sweep else train_new)(config, folder, overrides)
     return summary.get("value_mse", summary.get("hjb_sup_loss", float("nan")))
