@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 
 import pytest
 import torch
-from small import PHYSICS, QUICK, at_update, interrupt, small_config, small_trainer
+from small import PHYSICS, QUICK, at_update, command, interrupt, small_config, small_trainer
 
 import pirl_rl
 from pirl_rl import checkpoint, train
@@ -202,6 +203,39 @@ def test_the_command_trains_and_resumes_a_population(tmp_path, in_process):
     (tmp_path / "out" / "summary.json").unlink()
     resume(tmp_path / "out", [])
     assert (tmp_path / "out" / "summary.json").exists()
+
+
+DIES = """
+import os
+from pathlib import Path
+from pirl_rl.loggers import CSVLogger
+
+class Dies(CSVLogger):
+    made = 0
+    def __init__(self):
+        Dies.made += 1
+        if Dies.made == 2 and not Path("died").exists():
+            Path("died").touch()
+            os._exit(9)
+"""
+
+
+def test_a_population_that_was_killed_while_it_began_is_resumed(tmp_path, in_process, monkeypatch):
+    """The process dies while the second member begins; resumed, both end as in a population that was not killed."""
+    (tmp_path / "dies.py").write_text(DIES)
+    monkeypatch.syspath_prepend(tmp_path)
+    settings = (*QUICK, "trainer.seeds=[3,4]", "schedule.center=[0.2,0.4]", "report=false", "trainer.updates=6")
+    settings += ("logger._target_=dies.Dies",)
+    assert command(*settings, "hydra.run.dir=killed", cwd=tmp_path).returncode == 9
+    code, text = in_process(train)("resume=killed", "trust=[dies]")
+    assert code == 0, text
+    code, text = in_process(train)(*settings, "hydra.run.dir=whole")
+    assert code == 0, text
+    for name in ("0-pirl-3", "1-pirl-4"):
+        killed, whole = (RunDirectory(tmp_path / folder / name) for folder in ("killed", "whole"))
+        assert killed.metrics.read_text() == whole.metrics.read_text()
+        assert killed.overrides.read_text() == whole.overrides.read_text()
+    sys.modules.pop("dies", None)
 
 
 @pytest.mark.parametrize(
