@@ -17,7 +17,8 @@ from pirl_rl.commands.console import TRAINED, named_modules, override, quiet_lib
 from pirl_rl.commands.directory import own_directory
 from pirl_rl.commands.population import member_names
 from pirl_rl.commands.settings import compose_run, run_folder, typed_settings
-from pirl_rl.commands.train import train_new
+from pirl_rl.commands.train import go_on, train_new
+from pirl_rl.configuration import load_config
 from pirl_rl.errors import ArgumentError, ConfigError
 from pirl_rl.evaluation import evaluate as call_evaluators
 from pirl_rl.evaluation import metrics_of
@@ -35,6 +36,7 @@ def train(
     *,
     folder: str | PathLike[str] | None = None,
     seeds: None = None,
+    resume: None = None,
     **settings: Any,
 ) -> Run: ...
 @overload
@@ -43,28 +45,42 @@ def train(
     *,
     folder: str | PathLike[str] | None = None,
     seeds: Sequence[int],
+    resume: None = None,
     **settings: Any,
 ) -> list[Run]: ...
+@overload
+def train(
+    problem_or_experiment: ReachAvoidProblem | type[ReachAvoidProblem],
+    *,
+    folder: None = None,
+    seeds: None = None,
+    resume: str | PathLike[str],
+    **settings: Any,
+) -> Run | list[Run]: ...
 def train(
     problem_or_experiment: ReachAvoidProblem | type[ReachAvoidProblem] | str,
     *,
     folder: str | PathLike[str] | None = None,
     seeds: Sequence[int] | None = None,
+    resume: str | PathLike[str] | None = None,
     **settings: Any,
 ) -> Run | list[Run]:
-    """Train like `python -m pirl_rl.train`, in a new run directory.
+    """Train like `python -m pirl_rl.train`, in a new run directory or in that of a run that goes on.
 
         run = pirl_rl.train("reach1d", updates=2_000, seed=3)
         run = pirl_rl.train(MyProblem, method="pirl", **{"schedule.center": 1e3})
         runs = pirl_rl.train("reach1d", seeds=[0, 1, 2])
+        run = pirl_rl.train(problem, resume="runs/own/2026-01-31_12-00-00-0", updates=20_000)
 
     Args:
         problem_or_experiment: the name of an experiment, or a problem of your own, a class or an object, which is
             trained with the settings of the experiment `own`. The configuration of the run names a class that can be
             imported. It cannot name an object or a class of a notebook, so that such a run is opened with
-            `load_run(folder, problem=...)`.
+            `load_run(folder, problem=...)`, and resumed with `train(problem, resume=folder)`.
         folder: the run directory, new or empty; the default is `runs/<experiment>/<time>-<seed>`.
         seeds: trains a population with one member for each seed, see `pirl_rl.population`.
+        resume: the directory of a run, or of a population, that was trained on this problem and goes on from its last
+            checkpoint. `settings` change it for good.
         **settings: an argument of the trainer (`updates=200`), a key of the configuration (`seed=3`, `compile=False`),
             a choice of a group (`method="td3"`, `logger="none"`), a nested mapping (`schedule={"center": 1e3}`) or a
             key with dots (`**{"schedule.center": 1e3}`).
@@ -78,19 +94,29 @@ def train(
         DivergenceError: if a loss is not finite or explodes.
         Interrupted: if training was asked to stop; it can be resumed from the run directory.
     """
-    if "resume" in settings:
-        raise ConfigError("resume: expected settings of a new run; resume with python -m pirl_rl.train resume=RUN_DIR")
     experiment, problem, named, trust = _subject(problem_or_experiment)
     if seeds is not None:
         settings["trainer.seeds"] = list(seeds)
-    config, typed = compose_run(experiment, {**named, **settings})
-    default = run_folder(config)
-    path = own_directory(Path(default).absolute()) if folder is None else Path(folder).absolute()
     with warnings.catch_warnings():
         quiet_libraries()
-        train_new(config, path, typed, trust, problem)
+        if resume is not None:
+            if isinstance(problem_or_experiment, str) or folder is not None or seeds is not None:
+                raise ConfigError(
+                    "resume: expected a problem, and no folder and no seeds, which are those of the run; "
+                    "python -m pirl_rl.train resume=RUN_DIR resumes a run of an experiment"
+                )
+            path = Path(resume).absolute()
+            config = load_config(path)
+            config.trust = settings.get("trust", [])  # a run directory may be foreign and is not asked
+            typed = typed_settings({**named, **settings}, config, "trainer")
+            go_on(path, typed, trust, problem)
+        else:
+            config, typed = compose_run(experiment, {**named, **settings})
+            default = run_folder(config)
+            path = own_directory(Path(default).absolute()) if folder is None else Path(folder).absolute()
+            train_new(config, path, typed, trust, problem)
     modules = [*config.trust, *named_modules(typed), *trust]
-    if config.trainer.seeds is not None:
+    if config.trainer.get("seeds") is not None:
         return [load_run(path / name, modules, problem=problem) for name in member_names(config)]
     return load_run(path, modules, problem=problem)
 

@@ -126,6 +126,35 @@ def test_an_object_is_trained_and_given_again_to_open_its_run(tmp_path):
     assert pirl_rl.evaluate(again)["success_rate"] == pirl_rl.evaluate(trained)["success_rate"]
 
 
+def test_a_run_of_an_object_goes_on_with_the_object(tmp_path):
+    """It ends as a run that was not interrupted; the command line says what to do in place of it."""
+    problem = Reach1D(horizon=1.0)
+    settings = {**SETTINGS, "learner.decay": "constant", "report": False, "figures": False}
+    whole = pirl_rl.train(problem, folder=tmp_path / "whole", **settings)
+    pirl_rl.train(problem, folder=tmp_path / "cut", **{**settings, "updates": 6})
+    done = command(f"resume={tmp_path / 'cut'}", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "pirl_rl.train(problem, resume=folder)" in done.stderr
+    again = pirl_rl.train(problem, resume=tmp_path / "cut", updates=12)
+    assert again.update == 12
+    assert again.problem is problem
+    x = np.linspace(-2, 2, 9)[:, None]
+    assert np.array_equal(again.value(0.5, x), whole.value(0.5, x))
+    with pytest.raises(ConfigError, match="updats: expected one of"):
+        pirl_rl.train(problem, resume=tmp_path / "cut", updats=14)
+    with pytest.raises(ConfigError, match="resume: expected a problem, and no folder"):
+        pirl_rl.train(problem, resume=tmp_path / "cut", folder=tmp_path / "other")
+
+
+def test_a_population_of_an_object_goes_on_with_the_object(tmp_path):
+    problem, settings = Reach1D(horizon=1.0), {**SETTINGS, "report": False, "figures": False}
+    del settings["seed"]
+    pirl_rl.train(problem, folder=tmp_path / "out", seeds=[0, 1], **settings)
+    runs = pirl_rl.train(problem, resume=tmp_path / "out")
+    assert [run.update for run in runs] == [12, 12]
+    assert all(run.problem is problem for run in runs)
+
+
 def test_a_class_that_only_this_process_has_is_trained(tmp_path):
     class Here(Reach1D):
         pass

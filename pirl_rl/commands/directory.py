@@ -45,13 +45,19 @@ def begin(
     return trainer
 
 
-def reopen(config: DictConfig, folder: Path, arguments: Sequence[str], trust: Sequence[str]) -> Trainer:
+def reopen(
+    config: DictConfig,
+    folder: Path,
+    arguments: Sequence[str],
+    trust: Sequence[str],
+    problem: ReachAvoidProblem | None = None,
+) -> Trainer:
     """The trainer of a run that was begun, at its last checkpoint, or at update 0 without one.
 
     Raises:
         PirlError: if the configuration cannot be built, or the checkpoint does not fit it.
     """
-    trainer = make_trainer(config, folder, trust)
+    trainer = make_trainer(config, folder, trust, problem)
     if RunDirectory(folder).last.exists():
         restore(trainer)
     elif any(RunDirectory(folder).checkpoints.glob("weights-*.pt")):

@@ -68,7 +68,11 @@ def train_population(
 
 
 def resume_population(
-    config: DictConfig, folder: Path, overrides: Sequence[str], trust: Sequence[str]
+    config: DictConfig,
+    folder: Path,
+    overrides: Sequence[str],
+    trust: Sequence[str],
+    problem: ReachAvoidProblem | None = None,
 ) -> dict[str, float]:
     """Resume a population from the checkpoints of its members; returns the means of their summaries.
 
@@ -81,7 +85,7 @@ def resume_population(
         raise ConfigError(
             f"{changed[0]}: expected no other settings for a population; a member alone can be resumed with them"
         )
-    return _train(config, folder, OmegaConf.load(RunDirectory(folder).overrides), trust)
+    return _train(config, folder, OmegaConf.load(RunDirectory(folder).overrides), trust, problem)
 
 
 def member_names(config: DictConfig) -> list[str]:
@@ -138,7 +142,7 @@ def _train(
     folder: Path,
     overrides: Sequence[str],
     trust: Sequence[str],
-    problem: ReachAvoidProblem | None = None,
+    problem: ReachAvoidProblem | None,
 ) -> dict[str, float]:
     """Begin the members, or reopen those that were begun, and train them; arguments are those of `train_population`."""
     trainers, numbers, configs = [], [], []
@@ -148,7 +152,7 @@ def _train(
             if RunDirectory(path).config.exists():
                 stack.enter_context(locked(RunDirectory(path)))
                 configs.append(load_config(path))
-                trainers.append(reopen(configs[-1], path, [f"resume={folder.name}"], trust))
+                trainers.append(reopen(configs[-1], path, [f"resume={folder.name}"], trust, problem))
             else:
                 stack.enter_context(new_directory(path))
                 typed = [text for text in overrides if text.partition("=")[0].lstrip("+") not in (SEEDS, *own)]

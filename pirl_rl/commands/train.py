@@ -172,13 +172,16 @@ def resume(folder: Path, overrides: Sequence[str]) -> None:
         go_on(folder, overrides)
 
 
-def go_on(folder: Path, overrides: Sequence[str], trust: Sequence[str] = ()) -> dict[str, float]:
+def go_on(
+    folder: Path, overrides: Sequence[str], trust: Sequence[str] = (), problem: ReachAvoidProblem | None = None
+) -> dict[str, float]:
     """Resume a run; returns the summary.
 
     Args:
         folder: the run directory.
         overrides: overrides `key=value` that change its configuration for good. The modules that they name are trusted.
         trust: further modules outside the package that the configuration may name.
+        problem: replaces `env.problem`, for a run that was trained on an object.
 
     Raises:
         PirlError: if the run cannot be resumed, or training diverges or is interrupted.
@@ -192,8 +195,9 @@ def go_on(folder: Path, overrides: Sequence[str], trust: Sequence[str] = ()) -> 
             for text in overrides:
                 if text.startswith("trust="):
                     override(config, text)
-            return resume_population(config, folder, overrides, [*config.trust, *named_modules(overrides), *trust])
-    with reopened(folder, overrides, trust) as (trainer, config, modules):
+            modules = [*config.trust, *named_modules(overrides), *trust]
+            return resume_population(config, folder, overrides, modules, problem)
+    with reopened(folder, overrides, trust, problem) as (trainer, config, modules):
         summary = trainer.train()
         show(trainer, summary, config, modules)
         return summary
@@ -201,7 +205,7 @@ def go_on(folder: Path, overrides: Sequence[str], trust: Sequence[str] = ()) -> 
 
 @contextlib.contextmanager
 def reopened(
-    folder: Path, overrides: Sequence[str], trust: Sequence[str] = ()
+    folder: Path, overrides: Sequence[str], trust: Sequence[str] = (), problem: ReachAvoidProblem | None = None
 ) -> Iterator[tuple[Trainer, DictConfig, list[str]]]:
     """Open a run to go on with it; arguments and errors are those of `go_on`.
 
@@ -225,7 +229,7 @@ def reopened(
         if config.get("grid") is not None:
             raise ConfigError(f"resume: expected a run that was trained, but {folder} holds the solution of a grid")
         modules = [*config.trust, *named_modules(overrides), *trust]
-        yield reopen(config, folder, [f"resume={folder.name}", *overrides], modules), config, modules
+        yield reopen(config, folder, [f"resume={folder.name}", *overrides], modules, problem), config, modules
 
 
 def _folders(arguments: Sequence[str]) -> list[Path]:
