@@ -6,7 +6,7 @@ import copy
 import importlib
 import inspect
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any, overload
@@ -75,8 +75,9 @@ def train(
     Args:
         problem_or_experiment: the name of an experiment, or a problem of your own, a class or an object, which is
             trained with the settings of the experiment `own`. The configuration of the run names a class that can be
-            imported. It cannot name an object or a class of a notebook, so that such a run is opened with
-            `load_run(folder, problem=...)`, and resumed with `train(problem, resume=folder)`.
+            imported, with its arguments (`**{"env.problem.wind": -0.3}`). It cannot name an object or a class of a
+            notebook, so that such a run is opened with `load_run(folder, problem=...)`, and resumed with
+            `train(problem, resume=folder)`.
         folder: the run directory, new or empty; the default is `runs/<experiment>/<time>-<seed>`.
         seeds: trains a population with one member for each seed, see `pirl_rl.population`.
         resume: the directory of a run, or of a population, that was trained on this problem and goes on from its last
@@ -95,6 +96,8 @@ def train(
         Interrupted: if training was asked to stop; it can be resumed from the run directory.
     """
     experiment, problem, named, trust = _subject(problem_or_experiment)
+    if problem is not None:
+        _refuse_arguments(problem, settings)
     if seeds is not None:
         settings["trainer.seeds"] = list(seeds)
     with warnings.catch_warnings():
@@ -141,6 +144,22 @@ def _subject(subject: Any) -> tuple[str, ReachAvoidProblem | None, dict[str, str
         "problem_or_experiment: expected the name of an experiment, a ReachAvoidProblem or a subclass of it, got "
         f"{type(subject).__name__}"
     )
+
+
+def _refuse_arguments(problem: ReachAvoidProblem, settings: Mapping[str, Any]) -> None:
+    """Refuse arguments of a problem that is an object already.
+
+    Raises:
+        ConfigError: if the settings have a key of `env.problem`.
+    """
+    nested = settings.get("env")
+    within = nested if isinstance(nested, Mapping) else {}
+    keys = [*settings, *(f"env.{name}" for name in within)]
+    for key in (key for key in keys if key == "env.problem" or key.startswith("env.problem.")):
+        raise ConfigError(
+            f"{key}: expected no arguments of the problem, which is an object of {type(problem).__name__} that no "
+            f"configuration names; give them to {type(problem).__name__}(...) and train what it returns"
+        )
 
 
 def _importable(subject: type) -> bool:

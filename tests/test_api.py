@@ -13,6 +13,7 @@ import torch
 from small import command
 
 import pirl_rl
+from pirl_rl.commands.settings import compose_run
 from pirl_rl.errors import ArgumentError, ConfigError
 from pirl_rl.problems import Reach1D
 from pirl_rl.run_directory import RunDirectory
@@ -37,6 +38,14 @@ TYPED += (
 
 class Slower(Reach1D):
     """One that no other process can import by its module's name in a configuration without trust."""
+
+
+class Windy(Reach1D):
+    """One with an argument."""
+
+    def __init__(self, wind: float = 0.0):
+        super().__init__()
+        self.wind = wind
 
 
 @pytest.fixture(scope="module")
@@ -171,6 +180,26 @@ def test_a_class_that_can_be_imported_is_named_by_the_configuration(tmp_path):
         pirl_rl.load_run(tmp_path / "run")
 
 
+def test_a_class_takes_its_arguments_from_the_settings(tmp_path):
+    """By keys with dots or by a nested mapping, also those that the configuration does not have."""
+    few = {**SETTINGS, "updates": 2, "report": False, "figures": False}
+    run = pirl_rl.train(Windy, folder=tmp_path / "run", **few, **{"env.problem.wind": -0.25})
+    assert run.problem.wind == -0.25
+    nested = {"env.problem._target_": "my_module.MyProblem", "env": {"problem": {"wind": -0.25}}}
+    assert compose_run("own", nested)[0].env.problem.wind == -0.25
+    assert run.config.env.problem.wind == -0.25
+    with pytest.raises(ConfigError, match=r"env\.problem\.wnd: Windy has no such argument; expected one of wind"):
+        pirl_rl.train(Windy, folder=tmp_path / "other", **few, **{"env.problem.wnd": 1.0})
+
+
+@pytest.mark.parametrize("settings", [{"env.problem.horizon": 1.0}, {"env": {"problem": {"horizon": 1.0}}}], ids=str)
+def test_arguments_of_an_object_are_refused_with_what_to_do(settings, tmp_path):
+    message = r"env\.problem.*: expected no arguments of the problem, which is an object of Reach1D.*give them to "
+    with pytest.raises(ConfigError, match=message):
+        pirl_rl.train(Reach1D(), folder=tmp_path / "run", **settings)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -206,8 +235,6 @@ def test_what_is_no_problem_is_refused():
     ids=str,
 )
 def test_any_value_reaches_the_configuration(value):
-    from pirl_rl.commands.settings import compose_run
-
     config, _ = compose_run("reach1d", {"start": value})
     found = config._get_node("start")
     found = list(found) if isinstance(value, list) else found._value()
