@@ -40,7 +40,7 @@ from pirl_rl.commands.directory import begin, new_directory, own_directory, refu
 from pirl_rl.commands.methods import check_method
 from pirl_rl.commands.population import resume_population, train_population
 from pirl_rl.commands.solve import solve
-from pirl_rl.commands.start import adopt_networks
+from pirl_rl.commands.start import absolute_start, adopt_networks
 from pirl_rl.configuration import CONF, PACKAGE, load_config
 from pirl_rl.errors import INTERRUPTED, ConfigError
 from pirl_rl.lock import locked
@@ -60,6 +60,7 @@ NOTHING_NAMED = """error: nothing to train was named, expected one of
 def train(config: DictConfig) -> float:
     """Train a new run in Hydra's run directory; returns the error that an optimising sweeper can minimise."""
     hydra_config = HydraConfig.get()
+    absolute_start(config)
     folder = Path(hydra_config.runtime.output_dir)
     overrides = hydra_config.overrides.task
     foreign = dict.fromkeys(name for name in [*config.trust, *named_modules(overrides)] if name != PACKAGE.name)
