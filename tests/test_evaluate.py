@@ -51,6 +51,16 @@ def test_a_run_of_an_earlier_version_has_no_verbose(run, capsys):
     assert "success_rate" in capsys.readouterr().out
 
 
+def test_words_for_false_are_false(run, capsys):
+    few = [f"run={run[0]}", "evaluation.final=[success]", "evaluation.success.episodes=50", "report=off", "verbose=no"]
+    evaluate.main(few)
+    printed = capsys.readouterr().out
+    assert "report " not in printed
+    with pytest.raises(SystemExit):
+        evaluate.main([*few, "report=perhaps"])
+    assert "report: expected bool, got 'perhaps'" in capsys.readouterr().err
+
+
 def test_draws_nowhere_else(run, tmp_path, capsys):
     """A link in a directory from elsewhere is not followed."""
     folder = run[0]

@@ -13,11 +13,12 @@ from pathlib import Path
 import pytest
 import torch
 from omegaconf import OmegaConf
-from small import QUICK, command
+from small import QUICK, command, small_config
 
 import pirl_rl
 from pirl_rl import load_run, train
 from pirl_rl.commands import catalogue
+from pirl_rl.commands.train import prepare
 from pirl_rl.configuration import CONF, load_config
 from pirl_rl.lock import locked
 from pirl_rl.machine import read_sessions
@@ -94,6 +95,15 @@ def test_figures_and_report_can_be_left_out(method, cli, tmp_path):
     assert not list(only_run(tmp_path).rglob("*.html"))
 
 
+def test_words_for_false_are_false():
+    """Hydra reads them as text, and every text counts as true in Python."""
+    words = {"check": "off", "compile": "no", "figures": "Off", "report": "n", "verbose": "off"}
+    config = small_config(*(f"{name}={word}" for name, word in words.items()))
+    prepare(config, [])
+    assert [config[name] for name in words] == [False] * 5
+    assert config.learner.compile is False
+
+
 def test_without_arguments_it_says_what_it_needs(cli, tmp_path):
     code, text = cli()
     assert code == 1
@@ -136,7 +146,8 @@ def test_every_choice_trains(setting, cli, tmp_path, monkeypatch):
         (["critics=0"], "critics"),
         (["device=cuda"], "device"),
         (["device=tpu"], "device: expected auto, cpu or cuda"),
-        (["compile=maybe"], "learner.compile: expected bool"),
+        (["compile=maybe"], "compile: expected bool, got 'maybe'"),
+        (["figures=perhaps"], "figures: expected bool, got 'perhaps'"),
         (["logger._target_=os.system"], "logger._target_"),
         (["loss=td3"], "loss: expected settings with a _target_, got 'td3'"),
         (["critic.activation=Tnah"], "Tnah"),

@@ -20,6 +20,7 @@ from hydra.errors import CompactHydraException, HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from pirl_rl.building import convert
 from pirl_rl.errors import INTERRUPTED, ConfigError, Interrupted, PirlError
 from pirl_rl.places import is_users, users_frames
 from pirl_rl.progress import helped
@@ -59,6 +60,9 @@ def program(function: Callable[[Sequence[str]], None]) -> Callable[..., None]:
 
 TRAINED = ("actor", "critic", "critics")
 """Groups of settings that cannot change in a run that is trained, since they are those of its networks."""
+
+SWITCHES = ("check", "compile", "verbose", "figures", "report")
+"""Settings of the commands that are true or false."""
 
 Meanings = Mapping[str, Mapping[str, str]]
 """What metrics mean, by the group of the table to which they belong and by metric."""
@@ -112,6 +116,19 @@ def override(config: DictConfig, text: str) -> tuple[Any, Any]:
     before = OmegaConf.select(config, parsed.key_or_group)
     OmegaConf.update(config, parsed.key_or_group, parsed.value())
     return before, parsed.value()
+
+
+def read_switches(config: DictConfig) -> None:
+    """Replace words for true and false, such as `off`, which Hydra reads as text.
+
+    Args:
+        config: the configuration of a run; changed in place.
+
+    Raises:
+        ConfigError: if one of `SWITCHES` is no such word.
+    """
+    for name in (name for name in SWITCHES if name in config):
+        config[name] = convert(config[name], bool, name)
 
 
 @contextlib.contextmanager

@@ -24,7 +24,7 @@ from pathlib import Path
 from omegaconf import open_dict
 
 from pirl_rl.assembly import make_evaluation_simulator, make_evaluators, make_problem
-from pirl_rl.commands.console import TRAINED, named_modules, outcome, override, program, reported
+from pirl_rl.commands.console import TRAINED, named_modules, outcome, override, program, read_switches, reported
 from pirl_rl.commands.report import draw_again
 from pirl_rl.configuration import load_config
 from pirl_rl.errors import ConfigError
@@ -54,6 +54,7 @@ def main(arguments: Sequence[str]) -> None:
             if text.partition(".")[0] in TRAINED:
                 raise ConfigError(f"{text}: expected a setting of another group, since the networks are trained")
             override(config, text)
+        read_switches(config)
         trust = [*config.trust, *named_modules(overrides)]
         evaluators = make_evaluators(config.evaluation, "final", trust)
         problem = make_problem(config, trust) if any(text.startswith("env.problem") for text in overrides) else None

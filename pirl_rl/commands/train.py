@@ -35,7 +35,7 @@ from pirl_rl.assembly import make_problem
 from pirl_rl.commands.catalogue import choices
 from pirl_rl.commands.check import check_before_training
 from pirl_rl.commands.composition import check_overrides, drop_leftovers, register
-from pirl_rl.commands.console import named_modules, override, quiet_libraries, reported
+from pirl_rl.commands.console import named_modules, override, quiet_libraries, read_switches, reported
 from pirl_rl.commands.directory import begin, new_directory, own_directory, refuse_files, reopen, show
 from pirl_rl.commands.methods import check_method
 from pirl_rl.commands.population import resume_population, train_population
@@ -156,6 +156,7 @@ def prepare(
         PirlError: with what was expected and what was got.
     """
     # Modules that the user names are trusted; those that a run directory names are not, since it may be foreign.
+    read_switches(config)
     check_method(config, overrides)
     adopt_networks(config, overrides)
     modules = [*config.trust, *named_modules(overrides), *trust]
@@ -227,6 +228,7 @@ def reopened(
                 )
             if before != after and not text.startswith("trust="):  # which counts for this command alone
                 print(f"resume: {text.partition('=')[0]} was {before}, and is {after} from now on", flush=True)
+        read_switches(config)
         if config.get("grid") is not None:
             raise ConfigError(f"resume: expected a run that was trained, but {folder} holds the solution of a grid")
         modules = [*config.trust, *named_modules(overrides), *trust]
