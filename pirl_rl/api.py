@@ -118,7 +118,7 @@ def train(
             default = run_folder(config)
             path = own_directory(Path(default).absolute()) if folder is None else Path(folder).absolute()
             train_new(config, path, typed, trust, problem)
-    modules = [*config.trust, *named_modules(typed), *trust]
+    modules = [*named_modules(typed, config.trust), *trust]
     if config.trainer.get("seeds") is not None:
         return [load_run(path / name, modules, problem=problem) for name in member_names(config)]
     return load_run(path, modules, problem=problem)
@@ -172,14 +172,14 @@ def _importable(subject: type) -> bool:
         return False
 
 
-def evaluate(run: Run | str | PathLike[str], *, trust: Sequence[str] = (), **settings: Any) -> dict[str, float]:
+def evaluate(run: Run | str | PathLike[str], *, trust: Sequence[str] | str = (), **settings: Any) -> dict[str, float]:
     """Call the final evaluators of a run, with changed settings if wanted. Nothing is written.
 
         pirl_rl.evaluate(run, final=["success"], success={"episodes": 100_000})
 
     Args:
         run: a run, or its directory.
-        trust: modules outside pirl_rl that its configuration may name.
+        trust: modules outside pirl_rl that its configuration may name, a list or one name.
         **settings: entries of `evaluation`, or any key of the run's configuration, as in `train`.
 
     Returns:
@@ -199,6 +199,6 @@ def evaluate(run: Run | str | PathLike[str], *, trust: Sequence[str] = (), **set
                 "load_run(folder, problem=...) opens it with another problem"
             )
         override(config, text)
-    evaluators = make_evaluators(config.evaluation, "final", [*run.trust, *trust, *named_modules(typed)])
+    evaluators = make_evaluators(config.evaluation, "final", [*run.trust, *named_modules(typed, trust)])
     simulator = make_evaluation_simulator(config, run.problem)
     return metrics_of(call_evaluators(run.solution, simulator, evaluators))

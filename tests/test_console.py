@@ -14,7 +14,7 @@ from small import QUICK
 
 from pirl_rl import train
 from pirl_rl.building import build
-from pirl_rl.commands.console import reported
+from pirl_rl.commands.console import named_modules, reported
 from pirl_rl.errors import ArgumentError, ConfigError, PlanError
 from pirl_rl.problems import Reach1D
 
@@ -98,6 +98,12 @@ def test_build_leaves_other_errors_alone(cli):
         build(OmegaConf.create({"_target_": "broken.Choosy"}), "problem", ["broken"])
     with pytest.raises(ConfigError, match="problem: ReachAvoidProblem lacks diffusion, drift"):
         build(OmegaConf.create({"_target_": "pirl_rl.problem.ReachAvoidProblem"}), "problem")
+
+
+@pytest.mark.parametrize("trust", ["mine", "'mine'", "[mine]", "['mine']", ["mine"]])
+def test_one_module_needs_no_brackets(trust):
+    """A class that is named between quotes is that of the same module too."""
+    assert named_modules(["a=b", "env.problem._target_='other.Problem'"], trust) == ["mine", "other"]
 
 
 @pytest.mark.parametrize("error", [ArgumentError("a: b"), PlanError(["a: b"]), ConfigError("a: b")])

@@ -262,10 +262,11 @@ def test_python_trains_a_population(tmp_path):
     assert runs[0].update > 0
 
 
-def test_modules_that_a_resuming_command_names_are_trusted(tmp_path, monkeypatch):
+@pytest.mark.parametrize("trust", ["trust=[my_module]", "trust=my_module", "trust=['my_module']"])
+def test_modules_that_a_resuming_command_names_are_trusted(trust, tmp_path, monkeypatch):
     """A population of one's own problem is resumed by the line that it printed, with trust=[my_module]."""
     seen = []
     save_config(small_config("trainer.seeds=[0,1]"), tmp_path)
     monkeypatch.setattr("pirl_rl.commands.train.resume_population", lambda *arguments: seen.append(arguments[3]))
-    go_on(tmp_path, ["trust=[my_module]"], ["another"])
+    go_on(tmp_path, [trust], ["another"])
     assert seen == [["my_module", "another"]]

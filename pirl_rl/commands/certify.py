@@ -58,6 +58,7 @@ from typing import Any
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from pirl_rl.building import trusted_modules
 from pirl_rl.commands.console import program, reported
 from pirl_rl.commands.report import draw_again
 from pirl_rl.errors import ConfigError, ProofError
@@ -92,7 +93,7 @@ def main(arguments: Sequence[str]) -> None:
         methods = [item.partition("=")[2] for item in others if item.startswith("method=")]
         method = methods[-1] if methods else "statistical"
         settings = _settings(method, [item for item in others if not item.startswith("method=")])
-        trust = settings.pop("trust", ())
+        trust = trusted_modules(settings.pop("trust", None))
         run, directory = load_run(folder, trust), RunDirectory(folder)
         directory.refuse_links()
         lines = _prove(run, directory, settings) if method == "interval" else _certify(run, directory, settings)

@@ -20,7 +20,7 @@ from hydra.errors import CompactHydraException, HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from pirl_rl.building import convert
+from pirl_rl.building import convert, trusted_modules
 from pirl_rl.errors import INTERRUPTED, ConfigError, Interrupted, PirlError
 from pirl_rl.places import is_users, users_frames
 from pirl_rl.progress import helped
@@ -94,10 +94,10 @@ def metrics_table(summary: Mapping[str, float], meanings: Meanings) -> str:
     return "\n".join([*rows, ""])
 
 
-def named_modules(overrides: Sequence[str]) -> list[str]:
-    """The modules that the overrides name by a `_target_`."""
+def named_modules(overrides: Sequence[str], trust: str | Sequence[str] | None = ()) -> list[str]:
+    """The modules that a setting `trust` lists, and those that the overrides name by a `_target_`."""
     targets = [value for key, _, value in (item.partition("=") for item in overrides) if key.endswith("_target_")]
-    return [target.partition(".")[0] for target in targets]
+    return [*trusted_modules(trust), *(target.strip("'\"").partition(".")[0] for target in targets)]
 
 
 def override(config: DictConfig, text: str) -> tuple[Any, Any]:

@@ -55,7 +55,7 @@ def main(arguments: Sequence[str]) -> None:
                 raise ConfigError(f"{text}: expected a setting of another group, since the networks are trained")
             override(config, text)
         read_switches(config)
-        trust = [*config.trust, *named_modules(overrides)]
+        trust = named_modules(overrides, config.trust)
         evaluators = make_evaluators(config.evaluation, "final", trust)
         problem = make_problem(config, trust) if any(text.startswith("env.problem") for text in overrides) else None
         solution = load_run(folder, trust, device=config.device, problem=problem).solution

@@ -211,7 +211,7 @@ def _score(folder: Path, name: str, overrides: Sequence[str], truth: Truth, roll
 
 def _trusted(typed: Sequence[str]) -> list[str]:
     """The modules that settings of this command allow a run to import, whatever the run's own configuration says."""
-    return [*compose("train", typed).trust, *named_modules(typed)]
+    return named_modules(typed, compose("train", typed).trust)
 
 
 def _alternative(

@@ -63,7 +63,7 @@ def train(config: DictConfig) -> float:
     absolute_start(config)
     folder = Path(hydra_config.runtime.output_dir)
     overrides = hydra_config.overrides.task
-    foreign = dict.fromkeys(name for name in [*config.trust, *named_modules(overrides)] if name != PACKAGE.name)
+    foreign = dict.fromkeys(name for name in named_modules(overrides, config.trust) if name != PACKAGE.name)
     again = [f"trust=[{','.join(foreign)}]"] if foreign else []
     in_sweep = hydra_config.mode == RunMode.MULTIRUN
     if not in_sweep and not _folders(hydra_config.overrides.hydra):
@@ -88,7 +88,7 @@ def train_in_sweep(config: DictConfig, folder: Path, overrides: Sequence[str]) -
     if run.summary.exists():
         print(f"run      {run} is finished already", flush=True)
         return run.numbers()
-    return go_on(folder, [], [*config.trust, *named_modules(overrides)])
+    return go_on(folder, [], named_modules(overrides, config.trust))
 
 
 def refuse_other_settings(run: RunDirectory, overrides: Sequence[str], key: str) -> None:
@@ -159,7 +159,7 @@ def prepare(
     read_switches(config)
     check_method(config, overrides)
     adopt_networks(config, overrides)
-    modules = [*config.trust, *named_modules(overrides), *trust]
+    modules = [*named_modules(overrides, config.trust), *trust]
     drop_leftovers(config, overrides, modules)
     problem = make_problem(config, modules) if problem is None else problem
     if config.check:
@@ -197,7 +197,7 @@ def go_on(
             for text in overrides:
                 if text.startswith("trust="):
                     override(config, text)
-            modules = [*config.trust, *named_modules(overrides), *trust]
+            modules = [*named_modules(overrides, config.trust), *trust]
             return resume_population(config, folder, overrides, modules, problem)
     with reopened(folder, overrides, trust, problem) as (trainer, config, modules):
         summary = trainer.train()
@@ -231,7 +231,7 @@ def reopened(
         read_switches(config)
         if config.get("grid") is not None:
             raise ConfigError(f"resume: expected a run that was trained, but {folder} holds the solution of a grid")
-        modules = [*config.trust, *named_modules(overrides), *trust]
+        modules = [*named_modules(overrides, config.trust), *trust]
         yield reopen(config, folder, [f"resume={folder.name}", *overrides], modules, problem), config, modules
 
 

@@ -76,7 +76,7 @@ def tune(config: DictConfig) -> None:
                 f"parallel: expected 1 with population=true, which is one process, got {counts['parallel']}"
             )
         train = overrides_of_training(config, typed)
-        trust = [*config.trust, *named_modules(typed)]
+        trust = named_modules(typed, config.trust)
         advisor = build(config.advisor, "advisor", trust)
         trainer, path, final = _first(config, train, trust)
         config.start = str(path)
