@@ -49,6 +49,11 @@ class Interrupts(CSVLogger):
     def log(self, row):
         super().log(row)
         os.kill(os.getpid(), signal.SIGINT)
+
+
+class Missing(Reach1D):
+    def __init__(self):
+        open("nowhere.csv")
 """
 
 
@@ -68,6 +73,7 @@ def cli(in_process, tmp_path, monkeypatch):
         ("broken.Buggy", 8, "error: AttributeError: 'Buggy' object has no attribute 'speed'"),
         ("broken.Mistaken", 16, "error: ValueError: what is this"),
         ("broken.Library", 20, "error: RuntimeError: Sizes of tensors must match"),
+        ("broken.Missing", 34, "error: FileNotFoundError: [Errno 2] No such file or directory: 'nowhere.csv' ("),
         ("unreadable.Half", 1, "error: SyntaxError: invalid syntax"),
     ],
 )

@@ -152,14 +152,13 @@ def reported(folder: Path, one_of_many: bool = False, again: Sequence[str] = ())
         raise SystemExit(INTERRUPTED) from None
     except EXPECTED as error:
         _end(f"error: {_one_line(error)}", one_of_many)
-    except OSError as error:
-        if error.errno not in UNWRITABLE:
-            traceback.print_exc()
-        _end(f"error: {error.strerror or error}: {error.filename or folder}", one_of_many)
     except Exception as error:
         place = _users_place(error)
-        if not place or os.environ.get("HYDRA_FULL_ERROR") == "1":
+        told = place or (isinstance(error, OSError) and error.errno in UNWRITABLE)
+        if not told or (place and os.environ.get("HYDRA_FULL_ERROR") == "1"):
             traceback.print_exc()
+        if isinstance(error, OSError) and not place:
+            _end(f"error: {error.strerror or error}: {error.filename or folder}", one_of_many)
         reason = error.msg if isinstance(error, SyntaxError) else str(error)  # whose text repeats the place
         _end(f"error: {type(error).__name__}: {_first_line(reason)}{place}", one_of_many)
 
