@@ -150,6 +150,19 @@ def test_an_interrupted_population_goes_on_as_if_nothing_had_happened(tmp_path):
     assert_equal(whole, again, 1e-9)
 
 
+def test_ctrl_c_while_members_begin_ends_with_ctrl_c(tmp_path):
+    """The log of the second member was not opened, so that it is not closed."""
+    pytest.importorskip("tensorboard")
+    members = [small_trainer(tmp_path / str(s), f"seed={s}", "logger=tensorboard") for s in (0, 1)]
+
+    def stop():
+        raise KeyboardInterrupt
+
+    members[0].begin = stop
+    with pytest.raises(KeyboardInterrupt):
+        population(members).train()
+
+
 class Branches(Reach1D):
     """A drift with a decision on the values of the states, which cannot be made for all members at once."""
 
