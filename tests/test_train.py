@@ -21,6 +21,7 @@ from pirl_rl.commands import catalogue
 from pirl_rl.commands.train import prepare
 from pirl_rl.configuration import CONF, load_config
 from pirl_rl.lock import locked
+from pirl_rl.loggers import TorchRLLogger
 from pirl_rl.machine import read_sessions
 from pirl_rl.run_directory import RunDirectory
 
@@ -131,6 +132,24 @@ def test_every_choice_trains(setting, cli, tmp_path, monkeypatch):
         assert list(run.glob("wandb/offline-run-*/*.wandb"))
     if setting == "logger=tensorboard":
         assert list(run.glob("tensorboard/events*"))
+
+
+def test_a_resumed_run_is_the_same_one_of_weights_and_biases(tmp_path, monkeypatch):
+    """The members of a population have ids of their own."""
+    for name in ("WANDB_API_KEY", "WANDB_CACHE_DIR"):
+        monkeypatch.setenv(name, "")
+    monkeypatch.setenv("NETRC", str(tmp_path / "absent"))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    ids = []
+    for folder, updates in (("one", 3), ("one", 6), ("other", 3)):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        logger = TorchRLLogger("wandb")
+        logger.open(tmp_path / folder, {"trainer": {"updates": updates}})
+        logger.log({"update": updates, "loss": 0.5})
+        ids.append(logger.logger.experiment.id)
+        logger.close()
+    assert ids[0] == ids[1] != ids[2]
 
 
 @pytest.mark.parametrize(
