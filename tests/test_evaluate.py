@@ -77,6 +77,10 @@ def test_draws_nowhere_else(run, tmp_path, capsys):
     [
         ([], "run=RUN_DIR"),
         (["run=nowhere"], "nowhere is not a run directory"),
+        (
+            ["run={folder}", "run=other"],
+            "run: expected run=RUN_DIR once, the directory of a finished run, got {folder} and other",
+        ),
         (["run={folder}", "evaluation.success.episods=3"], "episods"),
         (["run={folder}", "evaluation.final=[excat]"], "excat"),
         (["run={folder}", "evaluation.success._target_=os.system"], "os.system"),
@@ -86,7 +90,7 @@ def test_mistakes_are_named(arguments, told, run, capsys):
     with pytest.raises(SystemExit) as stop:
         evaluate.main([argument.format(folder=run[0]) for argument in arguments])
     assert stop.value.code == 1
-    assert told in capsys.readouterr().err
+    assert told.format(folder=run[0]) in capsys.readouterr().err
 
 
 def test_help_is_the_docstring(capsys):

@@ -217,6 +217,10 @@ def test_a_mistake_leaves_folders_elsewhere(cli, tmp_path_factory):
         (["+experiment=own"], "env.problem._target_: a value is missing"),
         (["resume=nope"], "nope is not a run directory"),
         (["resume=."], ". is not a run directory"),
+        (
+            ["resume=a", "resume=b"],
+            "resume=RUN_DIR once, the directory of a run to resume, got a and b",
+        ),
         (["+experiment=own", "env.problem._target_=drowned.MyProblem"], "expected a target outside"),
     ],
     ids=lambda value: value[-1] if isinstance(value, list) else "",

@@ -59,7 +59,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from pirl_rl.building import trusted_modules
-from pirl_rl.commands.console import program, reported
+from pirl_rl.commands.console import one_folder, program, reported
 from pirl_rl.commands.report import draw_again
 from pirl_rl.errors import ConfigError, ProofError
 from pirl_rl.figures.files import save_figures
@@ -84,12 +84,10 @@ BOUNDS = ("lower", "upper")
 
 @program
 def main(arguments: Sequence[str]) -> None:
-    named = [item for item in arguments if item.startswith("run=")]
-    folder = Path(named[-1].partition("=")[2]) if named else Path()
+    with reported(Path()):
+        folder = one_folder(arguments, "run", "the directory of a finished run")
     with reported(folder):
-        if not named:
-            raise ConfigError("run: expected run=RUN_DIR, the directory of a finished run")
-        others = [item for item in arguments if item not in named]
+        others = [item for item in arguments if not item.startswith("run=")]
         methods = [item.partition("=")[2] for item in others if item.startswith("method=")]
         method = methods[-1] if methods else "statistical"
         settings = _settings(method, [item for item in others if not item.startswith("method=")])

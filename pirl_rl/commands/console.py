@@ -100,6 +100,18 @@ def named_modules(overrides: Sequence[str], trust: str | Sequence[str] | None = 
     return [*trusted_modules(trust), *(target.strip("'\"").partition(".")[0] for target in targets)]
 
 
+def one_folder(arguments: Sequence[str], key: str, meaning: str) -> Path:
+    """The folder that the only argument with a key names.
+
+    Raises:
+        ConfigError: if there is no such argument, or more than one, of which all others would be ignored.
+    """
+    named = [text.partition("=")[2] for text in arguments if text.startswith(f"{key}=")]
+    if len(named) != 1:
+        raise ConfigError(f"{key}: expected {key}=RUN_DIR once, {meaning}, got {' and '.join(named) or 'none'}")
+    return Path(named[0])
+
+
 def override(config: DictConfig, text: str) -> tuple[Any, Any]:
     """Apply an override `key=value` to the configuration of a run; returns the value before and the new one.
 

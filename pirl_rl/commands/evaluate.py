@@ -24,7 +24,16 @@ from pathlib import Path
 from omegaconf import open_dict
 
 from pirl_rl.assembly import make_evaluation_simulator, make_evaluators, make_problem
-from pirl_rl.commands.console import TRAINED, named_modules, outcome, override, program, read_switches, reported
+from pirl_rl.commands.console import (
+    TRAINED,
+    named_modules,
+    one_folder,
+    outcome,
+    override,
+    program,
+    read_switches,
+    reported,
+)
 from pirl_rl.commands.report import draw_again
 from pirl_rl.configuration import load_config
 from pirl_rl.errors import ConfigError
@@ -38,13 +47,10 @@ from pirl_rl.runs.load import load_run
 
 @program
 def main(arguments: Sequence[str]) -> None:
-    named = [item for item in arguments if item.startswith("run=")]
-    folder = Path(named[-1].partition("=")[2]) if named else Path()
-    run = RunDirectory(folder)
+    with reported(Path()):
+        folder = one_folder(arguments, "run", "the directory of a finished run")
     with reported(folder):
-        if not named:
-            raise ConfigError("run: expected run=RUN_DIR, the directory of a finished run")
-        overrides = [item for item in arguments if item not in named]
+        run, overrides = RunDirectory(folder), [text for text in arguments if not text.startswith("run=")]
         config = load_config(folder)
         config.trust = []
         with open_dict(config):

@@ -35,7 +35,7 @@ from pirl_rl.assembly import make_problem
 from pirl_rl.commands.catalogue import choices
 from pirl_rl.commands.check import check_before_training
 from pirl_rl.commands.composition import check_overrides, drop_leftovers, register
-from pirl_rl.commands.console import named_modules, override, quiet_libraries, read_switches, reported
+from pirl_rl.commands.console import named_modules, one_folder, override, quiet_libraries, read_switches, reported
 from pirl_rl.commands.directory import begin, new_directory, own_directory, refuse_files, reopen, show
 from pirl_rl.commands.methods import check_method
 from pirl_rl.commands.population import resume_population, train_population
@@ -252,7 +252,8 @@ def main() -> None:
     resumed = [item for item in arguments if item.startswith("resume=") and item != "resume=null"]
     try:
         if resumed:
-            folder = Path(resumed[-1].partition("=")[2])
+            with reported(Path()):
+                folder = one_folder(resumed, "resume", "the directory of a run to resume")
             resume(folder, [item for item in arguments if item not in resumed])
         else:
             with reported(Path()):
