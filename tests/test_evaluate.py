@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 
 import pytest
 from small import small_trainer
 
-from pirl_rl import evaluate, load_run
+from pirl_rl import certify, evaluate, load_run
 from pirl_rl.errors import ConfigError
 from pirl_rl.run_directory import RunDirectory
 
@@ -70,6 +72,25 @@ def test_draws_nowhere_else(run, tmp_path, capsys):
         evaluate.main([f"run={folder}"])
     link.unlink()
     assert "leads out of the run directory" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", [evaluate, certify])
+def test_a_directory_that_cannot_be_written_is_refused_before_the_work(command, run, monkeypatch, capsys):
+    """An administrator can write everywhere, so that the refusal of the operating system is imitated."""
+
+    def refuse(dir):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(dir))
+
+    def work(*arguments, **settings):
+        raise AssertionError("the work has begun")
+
+    monkeypatch.setattr("pirl_rl.run_directory.tempfile.TemporaryFile", refuse)
+    monkeypatch.setattr("pirl_rl.commands.evaluate.evaluate", work)
+    monkeypatch.setattr("pirl_rl.runs.run.Run.certify", work)
+    with pytest.raises(SystemExit) as stop:
+        command.main([f"run={run[0]}"])
+    assert stop.value.code == 1
+    assert f"{run[0]}: expected a directory that can be written" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -94,6 +94,7 @@ def main(arguments: Sequence[str]) -> None:
         trust = trusted_modules(settings.pop("trust", None))
         run, directory = load_run(folder, trust), RunDirectory(folder)
         directory.refuse_links()
+        directory.require_writable()
         lines = _prove(run, directory, settings) if method == "interval" else _certify(run, directory, settings)
     print("\n".join(lines))
     if run.config.get("report", True):

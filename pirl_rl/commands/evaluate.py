@@ -66,6 +66,7 @@ def main(arguments: Sequence[str]) -> None:
         problem = make_problem(config, trust) if any(text.startswith("env.problem") for text in overrides) else None
         solution = load_run(folder, trust, device=config.device, problem=problem).solution
         run.refuse_links()
+        run.require_writable()
         announce(f"measuring: {', '.join(evaluators)}")
         evidence = evaluate(solution, make_evaluation_simulator(config, solution.problem), evaluators)
         metrics = metrics_of(evidence)
