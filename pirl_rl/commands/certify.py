@@ -55,11 +55,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-
 from pirl_rl.building import trusted_modules
-from pirl_rl.commands.console import one_folder, program, reported
+from pirl_rl.commands.console import one_folder, program, read_settings, reported
 from pirl_rl.commands.report import draw_again
 from pirl_rl.errors import ConfigError, ProofError
 from pirl_rl.figures.files import save_figures
@@ -214,7 +211,4 @@ def _settings(method: str, arguments: Sequence[str]) -> dict[str, Any]:
     for text in arguments:
         if "=" not in text or text.partition("=")[0] not in known:
             raise ConfigError(f"{text}: expected key=value with a key out of {', '.join(sorted(known))}")
-    try:
-        return OmegaConf.to_container(OmegaConf.from_dotlist([*arguments]))  # type: ignore[return-value]
-    except (OmegaConfBaseException, ValueError) as error:
-        raise ConfigError(f"certify: {error}") from None
+    return read_settings(arguments)

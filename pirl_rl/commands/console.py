@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import CompactHydraException, HydraException
 from omegaconf import DictConfig, OmegaConf
@@ -25,7 +26,7 @@ from pirl_rl.errors import INTERRUPTED, ConfigError, Interrupted, PirlError
 from pirl_rl.places import is_users, users_frames
 from pirl_rl.progress import helped
 
-EXPECTED = (PirlError, HydraException, OmegaConfBaseException)
+EXPECTED = (PirlError, HydraException, OmegaConfBaseException, yaml.YAMLError)
 """Errors whose message alone tells the user what to correct."""
 
 UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM)
@@ -112,6 +113,24 @@ def one_folder(arguments: Sequence[str], key: str, meaning: str) -> Path:
     return Path(named[0])
 
 
+def read_settings(arguments: Sequence[str]) -> dict[str, Any]:
+    """The settings of a command without a configuration, by their keys.
+
+    Args:
+        arguments: settings `key=value`, with values in YAML.
+
+    Raises:
+        ConfigError: with the argument that cannot be read.
+    """
+    settings = OmegaConf.create()
+    for text in arguments:
+        try:
+            settings.merge_with_dotlist([text])
+        except (OmegaConfBaseException, ValueError, yaml.YAMLError) as error:
+            raise ConfigError(f"{text}: expected key=value ({_first_line(str(error))})") from None
+    return OmegaConf.to_container(settings)  # type: ignore[return-value]
+
+
 def override(config: DictConfig, text: str) -> tuple[Any, Any]:
     """Apply an override `key=value` to the configuration of a run; returns the value before and the new one.
 
@@ -185,6 +204,8 @@ def _end(message: str, one_of_many: bool) -> None:
 def _one_line(error: Exception) -> str:
     if isinstance(error, OmegaConfBaseException):
         return f"{error.full_key}: {_first_line(str(error.msg))}"
+    if isinstance(error, yaml.YAMLError):
+        return " ".join(str(error).split())  # the file and the line stand at its end
     return str(error)
 
 
