@@ -6,7 +6,7 @@
 .hydra/lock             held by the process that writes into the directory, which .hydra/holder names
 metrics.csv             one row of metrics for each logged update
 summary.json            the verdict, the metrics of the final evaluation, and the length of the training
-evaluation.json         the metrics of a later `python -m pirl_rl.evaluate`
+evaluation.json         the metrics of a later `python -m pirl_rl.evaluate`, and the settings that they depend on
 certificate.json        the claims of `python -m pirl_rl.certify`
 proof.json, proof.npz   what `python -m pirl_rl.certify method=interval` proved, in words and as a function
 limit.json, limit.npz   what it proved of all policies, with bounds=[upper]

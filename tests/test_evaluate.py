@@ -26,7 +26,10 @@ def test_repeats_the_summary(run, capsys):
     folder, summary = run
     evaluate.main([f"run={folder}"])
     results = json.loads((folder / "evaluation.json").read_text())
+    settings = results.pop("settings")
     assert results == {name: summary[name] for name in results}
+    assert settings["success"]["episodes"] == 64
+    assert (settings["simulator"]["dt"], settings["simulator"]["substeps"]) == (0.1, 1)
     assert "value_mse" in results
     printed = capsys.readouterr().out
     assert "value_mse" in printed
@@ -40,6 +43,9 @@ def test_takes_other_samples(run):
     results = json.loads((folder / "evaluation.json").read_text())
     width, before = (entry["success_high"] - entry["success_low"] for entry in (results, summary))
     assert "value_mse" not in results
+    assert {*results["settings"]} == {"problem", "simulator", "success"}
+    assert results["settings"]["success"]["episodes"] == 2000
+    assert results["settings"]["success"]["seed"] == load_run(folder).config.evaluation.success.seed
     assert width < before / 2  # 2,000 episodes against the debug configuration's 64
 
 
@@ -123,7 +129,9 @@ def test_a_changed_problem_is_the_one_that_is_measured(run, capsys):
     """Within a tenth of the horizon hardly any path reaches the target."""
     folder, summary = run
     evaluate.main([f"run={folder}", "evaluation.final=[success]", "env.problem.horizon=0.2", "report=false"])
-    assert json.loads((folder / "evaluation.json").read_text())["success_rate"] < summary["success_rate"] / 2
+    results = json.loads((folder / "evaluation.json").read_text())
+    assert results["success_rate"] < summary["success_rate"] / 2
+    assert results["settings"]["problem"]["horizon"] == 0.2
     with pytest.raises(SystemExit):
         evaluate.main([f"run={folder}", "actor.hidden=[7]"])
     assert "actor.hidden=[7]: expected a setting of another group" in capsys.readouterr().err

@@ -2,8 +2,8 @@
 
     python -m pirl_rl.evaluate run=RUN_DIR [key=value ...]
 
-Calls the final evaluators of the run, writes their metrics and the verdict to evaluation.json in the run directory, and
-draws its figures and its report.
+Calls the final evaluators of the run, writes their metrics and the verdict to evaluation.json in the run directory,
+with the settings of the problem, the simulator and the evaluators, and draws its figures and its report.
 
     run           the directory of a finished run
     verbose=true  prints all metrics with their meaning
@@ -21,7 +21,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from omegaconf import open_dict
+from omegaconf import OmegaConf, open_dict
 
 from pirl_rl.assembly import make_evaluation_simulator, make_evaluators, make_problem
 from pirl_rl.commands.console import (
@@ -70,8 +70,10 @@ def main(arguments: Sequence[str]) -> None:
         announce(f"measuring: {', '.join(evaluators)}")
         evidence = evaluate(solution, make_evaluation_simulator(config, solution.problem), evaluators)
         metrics = metrics_of(evidence)
+        nodes = {"problem": config.env.problem} | {name: config.evaluation[name] for name in ("simulator", *evaluators)}
+        settings = {"settings": {name: OmegaConf.to_container(node, resolve=True) for name, node in nodes.items()}}
         with replacing(run.evaluation) as file:
-            file.write(json.dumps(statements_of(evidence) | metrics, indent=2) + "\n")
+            file.write(json.dumps(statements_of(evidence) | metrics | settings, indent=2) + "\n")
         figures = draw_run(solution, run.metrics, run.figures, evidence)
     meanings = meanings_of(evaluators, solution.problem)
     print(outcome(lines_of(evidence), metrics, meanings, config.verbose))
