@@ -75,7 +75,8 @@ def make_problem(config: DictConfig, trust: Sequence[str] = ()) -> ReachAvoidPro
     if isinstance(node, DictConfig) and OmegaConf.is_missing(node, "_target_"):
         raise ConfigError(
             "env.problem._target_: a value is missing, give env.problem._target_=my_module.MyProblem; a run that was "
-            "trained on an object of Python code opens with load_run(folder, problem=...)"
+            "trained on an object of Python code opens with load_run(folder, problem=...), and goes on with "
+            "pirl_rl.train(problem, resume=folder)"
         )
     return build(node, "env.problem", trust)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import re
 import typing
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -103,6 +104,15 @@ def resolve(target: str, key: str, trust: Sequence[str] = ()) -> Any:
     if not (own or (callable(found) and _within(defined_in, trust))):
         raise ConfigError(f"{key}: {target} is not a class defined in {' or '.join(('pirl_rl', *trust))}")
     return found
+
+
+def trusted_modules(trust: str | Sequence[str] | None) -> list[str]:
+    """The names of the modules in a setting `trust`.
+
+    Args:
+        trust: a list of names, or text such as "my_module", "[my_module,other]" or "['my_module']".
+    """
+    return re.findall(r"[\w.]+", trust) if isinstance(trust, str) else [*(trust or ())]
 
 
 def _within(name: str, modules: Sequence[str]) -> bool:

@@ -106,6 +106,8 @@ class TorchRLLogger(CSVLogger):
             offline = "WANDB_MODE" not in os.environ and not _has_wandb_account()
             # The members of a population are open at once, each as a run of its own.
             options = {"project": self.project, "offline": offline, "config": dict(config), "reinit": "create_new"}
+            # A run that is resumed goes on as the same run of W&B, also with other settings.
+            options |= {"id": _wandb_id(folder), "allow_val_change": True}
             extra = {"wandb_kwargs": options}
         self.logger: Any = get_logger(self.kind, logger_name=str(folder), experiment_name=name, **extra)
 
@@ -152,6 +154,12 @@ def read_metrics(path: str | Path) -> dict[str, np.ndarray]:
         rows = csv.DictReader(file)
         names, cells = rows.fieldnames or [], list(rows)
     return {name: np.array([float(row[name] or "nan") for row in cells]) for name in names}
+
+
+def _wandb_id(folder: Path) -> str | None:
+    """The id of the run of W&B in a run directory, which the names of its folders end with; None if there is none."""
+    names = sorted(path.name.removeprefix("offline-") for path in folder.glob("wandb/*run-*-*"))
+    return names[-1].rpartition("-")[2] if names else None
 
 
 def _has_wandb_account() -> bool:

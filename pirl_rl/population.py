@@ -13,7 +13,7 @@ equals the one alone in law only, since the members share the random numbers of 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Any
 
@@ -72,22 +72,17 @@ class Population:
         Raises:
             Interrupted: on SIGINT, after a checkpoint of each member.
         """
-        joint = None
-        try:
-            with interruptible() as interrupted, _without_denormals():
-                joint = self._join()
-                for index, member in enumerate(self.members):
-                    with self._as_alone(index):
-                        member.open()
-                        if not member.ended:
-                            member.begin()
-                announce("training")
-                self._loop(interrupted)
-        finally:
-            for member in self.members:
-                member.close()
-            if joint:
-                joint.close()
+        with ExitStack() as opened, interruptible() as interrupted, _without_denormals():
+            if joint := self._join():
+                opened.callback(joint.close)
+            for index, member in enumerate(self.members):
+                with self._as_alone(index):
+                    member.open()
+                    opened.callback(member.close)
+                    if not member.ended:
+                        member.begin()
+            announce("training")
+            self._loop(interrupted)
         summaries: list[dict[str, float] | None] = [None] * len(self.members)
         for index, member in enumerate(self.members):
             if index not in self.errors:

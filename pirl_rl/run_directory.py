@@ -6,7 +6,7 @@
 .hydra/lock             held by the process that writes into the directory, which .hydra/holder names
 metrics.csv             one row of metrics for each logged update
 summary.json            the verdict, the metrics of the final evaluation, and the length of the training
-evaluation.json         the metrics of a later `python -m pirl_rl.evaluate`
+evaluation.json         the metrics of a later `python -m pirl_rl.evaluate`, and the settings that they depend on
 certificate.json        the claims of `python -m pirl_rl.certify`
 proof.json, proof.npz   what `python -m pirl_rl.certify method=interval` proved, in words and as a function
 limit.json, limit.npz   what it proved of all policies, with bounds=[upper]
@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import json
 import os
+import tempfile
 from pathlib import Path
 
 from pirl_rl.errors import CheckpointError, ConfigError
@@ -188,6 +189,23 @@ class RunDirectory:
     def of_checkpoint(cls, path: Path) -> RunDirectory:
         """The run directory of a file in `checkpoints/`."""
         return cls(path.parent.parent)
+
+    def require_writable(self) -> None:
+        """Refuse a directory into which no file can be written, before work that would be lost.
+
+        Raises:
+            ConfigError: with the reason of the operating system.
+        """
+        try:
+            with tempfile.TemporaryFile(dir=self.path) as file:
+                file.write(b"0")
+                file.flush()  # a full disk refuses this
+        except OSError as error:
+            raise ConfigError(
+                f"{self.path}: expected a directory that can be written, where the results are kept, got: "
+                f"{error.strerror}; copy the run to another place, or measure it from Python, where "
+                "pirl_rl.evaluate and run.certify write nothing"
+            ) from None
 
     def refuse_links(self) -> None:
         """Refuse a directory whose links would make this program write outside it.

@@ -13,6 +13,7 @@ import torch
 from small import command
 
 import pirl_rl
+from pirl_rl.commands.settings import compose_run
 from pirl_rl.errors import ArgumentError, ConfigError
 from pirl_rl.problems import Reach1D
 from pirl_rl.run_directory import RunDirectory
@@ -37,6 +38,14 @@ TYPED += (
 
 class Slower(Reach1D):
     """One that no other process can import by its module's name in a configuration without trust."""
+
+
+class Windy(Reach1D):
+    """One with an argument."""
+
+    def __init__(self, wind: float = 0.0):
+        super().__init__()
+        self.wind = wind
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +135,35 @@ def test_an_object_is_trained_and_given_again_to_open_its_run(tmp_path):
     assert pirl_rl.evaluate(again)["success_rate"] == pirl_rl.evaluate(trained)["success_rate"]
 
 
+def test_a_run_of_an_object_goes_on_with_the_object(tmp_path):
+    """It ends as a run that was not interrupted; the command line says what to do in place of it."""
+    problem = Reach1D(horizon=1.0)
+    settings = {**SETTINGS, "learner.decay": "constant", "report": False, "figures": False}
+    whole = pirl_rl.train(problem, folder=tmp_path / "whole", **settings)
+    pirl_rl.train(problem, folder=tmp_path / "cut", **{**settings, "updates": 6})
+    done = command(f"resume={tmp_path / 'cut'}", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "pirl_rl.train(problem, resume=folder)" in done.stderr
+    again = pirl_rl.train(problem, resume=tmp_path / "cut", updates=12)
+    assert again.update == 12
+    assert again.problem is problem
+    x = np.linspace(-2, 2, 9)[:, None]
+    assert np.array_equal(again.value(0.5, x), whole.value(0.5, x))
+    with pytest.raises(ConfigError, match="updats: expected one of"):
+        pirl_rl.train(problem, resume=tmp_path / "cut", updats=14)
+    with pytest.raises(ConfigError, match="resume: expected a problem, and no folder"):
+        pirl_rl.train(problem, resume=tmp_path / "cut", folder=tmp_path / "other")
+
+
+def test_a_population_of_an_object_goes_on_with_the_object(tmp_path):
+    problem, settings = Reach1D(horizon=1.0), {**SETTINGS, "report": False, "figures": False}
+    del settings["seed"]
+    pirl_rl.train(problem, folder=tmp_path / "out", seeds=[0, 1], **settings)
+    runs = pirl_rl.train(problem, resume=tmp_path / "out")
+    assert [run.update for run in runs] == [12, 12]
+    assert all(run.problem is problem for run in runs)
+
+
 def test_a_class_that_only_this_process_has_is_trained(tmp_path):
     class Here(Reach1D):
         pass
@@ -137,9 +175,30 @@ def test_a_class_that_only_this_process_has_is_trained(tmp_path):
 def test_a_class_that_can_be_imported_is_named_by_the_configuration(tmp_path):
     trained = pirl_rl.train(Slower, folder=tmp_path / "run", **SETTINGS)
     assert trained.config.env.problem._target_ == f"{__name__}.Slower"
-    assert type(pirl_rl.load_run(tmp_path / "run", trust=(__name__,)).problem) is Slower
+    for trust in ((__name__,), __name__):
+        assert type(pirl_rl.load_run(tmp_path / "run", trust=trust).problem) is Slower
     with pytest.raises(ConfigError, match=rf"trust=\[{__name__}\]"):
         pirl_rl.load_run(tmp_path / "run")
+
+
+def test_a_class_takes_its_arguments_from_the_settings(tmp_path):
+    """By keys with dots or by a nested mapping, also those that the configuration does not have."""
+    few = {**SETTINGS, "updates": 2, "report": False, "figures": False}
+    run = pirl_rl.train(Windy, folder=tmp_path / "run", **few, **{"env.problem.wind": -0.25})
+    assert run.problem.wind == -0.25
+    nested = {"env.problem._target_": "my_module.MyProblem", "env": {"problem": {"wind": -0.25}}}
+    assert compose_run("own", nested)[0].env.problem.wind == -0.25
+    assert run.config.env.problem.wind == -0.25
+    with pytest.raises(ConfigError, match=r"env\.problem\.wnd: Windy has no such argument; expected one of wind"):
+        pirl_rl.train(Windy, folder=tmp_path / "other", **few, **{"env.problem.wnd": 1.0})
+
+
+@pytest.mark.parametrize("settings", [{"env.problem.horizon": 1.0}, {"env": {"problem": {"horizon": 1.0}}}], ids=str)
+def test_arguments_of_an_object_are_refused_with_what_to_do(settings, tmp_path):
+    message = r"env\.problem.*: expected no arguments of the problem, which is an object of Reach1D.*give them to "
+    with pytest.raises(ConfigError, match=message):
+        pirl_rl.train(Reach1D(), folder=tmp_path / "run", **settings)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
@@ -177,8 +236,6 @@ def test_what_is_no_problem_is_refused():
     ids=str,
 )
 def test_any_value_reaches_the_configuration(value):
-    from pirl_rl.commands.settings import compose_run
-
     config, _ = compose_run("reach1d", {"start": value})
     found = config._get_node("start")
     found = list(found) if isinstance(value, list) else found._value()

@@ -357,6 +357,7 @@ def test_one_start_from_the_command_line(trained, in_process):
     ("arguments", "message"),
     [
         ([], "run: expected run=RUN_DIR"),
+        (["run=a", "run=b"], "run: expected run=RUN_DIR once, the directory of a finished run, got a and b"),
         (["run={}", "states"], "states: expected key=value with a key out of at_least"),
         (["run={}", "claims=[proof]"], "claims: expected a list of names out of success, threshold, band"),
         (["run={}", "x=[0,1]"], r"x: expected states of shape (\*, 1), got (1, 2)"),

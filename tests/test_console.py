@@ -14,7 +14,7 @@ from small import QUICK
 
 from pirl_rl import train
 from pirl_rl.building import build
-from pirl_rl.commands.console import reported
+from pirl_rl.commands.console import named_modules, reported
 from pirl_rl.errors import ArgumentError, ConfigError, PlanError
 from pirl_rl.problems import Reach1D
 
@@ -49,6 +49,11 @@ class Interrupts(CSVLogger):
     def log(self, row):
         super().log(row)
         os.kill(os.getpid(), signal.SIGINT)
+
+
+class Missing(Reach1D):
+    def __init__(self):
+        open("nowhere.csv")
 """
 
 
@@ -68,6 +73,7 @@ def cli(in_process, tmp_path, monkeypatch):
         ("broken.Buggy", 8, "error: AttributeError: 'Buggy' object has no attribute 'speed'"),
         ("broken.Mistaken", 16, "error: ValueError: what is this"),
         ("broken.Library", 20, "error: RuntimeError: Sizes of tensors must match"),
+        ("broken.Missing", 34, "error: FileNotFoundError: [Errno 2] No such file or directory: 'nowhere.csv' ("),
         ("unreadable.Half", 1, "error: SyntaxError: invalid syntax"),
     ],
 )
@@ -98,6 +104,12 @@ def test_build_leaves_other_errors_alone(cli):
         build(OmegaConf.create({"_target_": "broken.Choosy"}), "problem", ["broken"])
     with pytest.raises(ConfigError, match="problem: ReachAvoidProblem lacks diffusion, drift"):
         build(OmegaConf.create({"_target_": "pirl_rl.problem.ReachAvoidProblem"}), "problem")
+
+
+@pytest.mark.parametrize("trust", ["mine", "'mine'", "[mine]", "['mine']", ["mine"]])
+def test_one_module_needs_no_brackets(trust):
+    """A class that is named between quotes is that of the same module too."""
+    assert named_modules(["a=b", "env.problem._target_='other.Problem'"], trust) == ["mine", "other"]
 
 
 @pytest.mark.parametrize("error", [ArgumentError("a: b"), PlanError(["a: b"]), ConfigError("a: b")])

@@ -16,7 +16,7 @@ import pytest
 import torch
 
 import pirl_rl
-from pirl_rl import check, compare, evaluate, export, suite, train, tune
+from pirl_rl import certify, check, compare, evaluate, export, suite, train, tune
 from pirl_rl.errors import PirlError
 from pirl_rl.problems import ZermeloBoat
 from pirl_rl.run_directory import RunDirectory
@@ -219,6 +219,9 @@ COMMANDS = {
     "export over a file": (export, ("run=run", "out=own.py"), "own.py exists, and an export never overwrites"),
     "check of nothing": (check, ("own:Nothing",), "own has no class 'Nothing'"),
     "check with a step of text": (check, ("own:Own", "dt=soon"), "dt: expected 0 < dt <= horizon = 1.0, got 'soon'"),
+    "check with open brackets": (check, ("own:Own", "dt=["), r"dt=\[: expected key=value \(while parsing"),
+    "certificate with open brackets": (certify, ("run=run", "x=[0"), r"x=\[0: expected key=value \(while parsing"),
+    "suite with open brackets": (suite, ("seeds=[0",), r"seeds=\[0: expected key=value \(while parsing"),
     "suite of nothing known": (suite, ("problems=[chess]",), "problems: expected names out of"),
     "loop from nowhere": (tune, ("+experiment=reach1d", "start=nowhere"), "no checkpoint at nowhere"),
     "loop of many rounds": (tune, ("+experiment=reach1d", "start=run", "rounds=many"), "rounds: expected int"),
@@ -347,11 +350,12 @@ def test_a_linked_folder_is_not_written_through(workplace, in_process):
     assert contents(workplace / "outside") == before
 
 
-def test_a_spoilt_summary_is_refused_by_those_who_read_it(workplace, in_process):
-    (workplace / "run" / RunDirectory.SUMMARY).write_text("{")
+@pytest.mark.parametrize("spoilt", [RunDirectory.SUMMARY, RunDirectory.CONFIG])
+def test_a_spoilt_file_is_refused_by_those_who_compare(spoilt, workplace, in_process):
+    (workplace / "run" / spoilt).write_text("{")
     code, printed = in_process(compare)("run")
     assert code != 0
-    assert "summary.json" in printed
+    assert spoilt.name in printed
     assert "Traceback" not in printed
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 
 import pytest
 import torch
-from small import PHYSICS, QUICK, at_update, interrupt, small_config, small_trainer
+from small import PHYSICS, QUICK, at_update, command, interrupt, small_config, small_trainer
 
 import pirl_rl
 from pirl_rl import checkpoint, train
@@ -149,6 +150,19 @@ def test_an_interrupted_population_goes_on_as_if_nothing_had_happened(tmp_path):
     assert_equal(whole, again, 1e-9)
 
 
+def test_ctrl_c_while_members_begin_ends_with_ctrl_c(tmp_path):
+    """The log of the second member was not opened, so that it is not closed."""
+    pytest.importorskip("tensorboard")
+    members = [small_trainer(tmp_path / str(s), f"seed={s}", "logger=tensorboard") for s in (0, 1)]
+
+    def stop():
+        raise KeyboardInterrupt
+
+    members[0].begin = stop
+    with pytest.raises(KeyboardInterrupt):
+        population(members).train()
+
+
 class Branches(Reach1D):
     """A drift with a decision on the values of the states, which cannot be made for all members at once."""
 
@@ -204,6 +218,39 @@ def test_the_command_trains_and_resumes_a_population(tmp_path, in_process):
     assert (tmp_path / "out" / "summary.json").exists()
 
 
+DIES = """
+import os
+from pathlib import Path
+from pirl_rl.loggers import CSVLogger
+
+class Dies(CSVLogger):
+    made = 0
+    def __init__(self):
+        Dies.made += 1
+        if Dies.made == 2 and not Path("died").exists():
+            Path("died").touch()
+            os._exit(9)
+"""
+
+
+def test_a_population_that_was_killed_while_it_began_is_resumed(tmp_path, in_process, monkeypatch):
+    """The process dies while the second member begins; resumed, both end as in a population that was not killed."""
+    (tmp_path / "dies.py").write_text(DIES)
+    monkeypatch.syspath_prepend(tmp_path)
+    settings = (*QUICK, "trainer.seeds=[3,4]", "schedule.center=[0.2,0.4]", "report=false", "trainer.updates=6")
+    settings += ("logger._target_=dies.Dies",)
+    assert command(*settings, "hydra.run.dir=killed", cwd=tmp_path).returncode == 9
+    code, text = in_process(train)("resume=killed", "trust=[dies]")
+    assert code == 0, text
+    code, text = in_process(train)(*settings, "hydra.run.dir=whole")
+    assert code == 0, text
+    for name in ("0-pirl-3", "1-pirl-4"):
+        killed, whole = (RunDirectory(tmp_path / folder / name) for folder in ("killed", "whole"))
+        assert killed.metrics.read_text() == whole.metrics.read_text()
+        assert killed.overrides.read_text() == whole.overrides.read_text()
+    sys.modules.pop("dies", None)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -228,10 +275,11 @@ def test_python_trains_a_population(tmp_path):
     assert runs[0].update > 0
 
 
-def test_modules_that_a_resuming_command_names_are_trusted(tmp_path, monkeypatch):
+@pytest.mark.parametrize("trust", ["trust=[my_module]", "trust=my_module", "trust=['my_module']"])
+def test_modules_that_a_resuming_command_names_are_trusted(trust, tmp_path, monkeypatch):
     """A population of one's own problem is resumed by the line that it printed, with trust=[my_module]."""
     seen = []
     save_config(small_config("trainer.seeds=[0,1]"), tmp_path)
     monkeypatch.setattr("pirl_rl.commands.train.resume_population", lambda *arguments: seen.append(arguments[3]))
-    go_on(tmp_path, ["trust=[my_module]"], ["another"])
+    go_on(tmp_path, [trust], ["another"])
     assert seen == [["my_module", "another"]]

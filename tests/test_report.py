@@ -117,7 +117,9 @@ def folder(tmp_path_factory) -> Path:
         "verdict_lines": "verdict  no\nnext  go",
     }
     (path / "summary.json").write_text(json.dumps(words | summary | {"value_max_error": float("nan")}))
-    (path / "evaluation.json").write_text(json.dumps({"value_mse": 0.125, "unheard_of": 3}))
+    (path / "evaluation.json").write_text(
+        json.dumps({"value_mse": 0.125, "unheard_of": 3, "settings": {"success": {}}})
+    )
     networks = page.Contents.of(path, page.Budget(10**6, 10**6)).networks
     (path / "certificate.json").write_text(json.dumps(CERTIFICATE | {"networks": networks}))
     (path / "proof.json").write_text(json.dumps(PROOF | {"networks": "of another run"}))

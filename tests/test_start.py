@@ -197,6 +197,15 @@ def test_the_command_starts_from_a_run(first, cli, tmp_path):
     assert load_config(run).start == str(tmp_path / "link" / RunDirectory.LAST)
 
 
+def test_a_relative_start_is_that_of_the_directory_where_the_command_was_given(first, cli, tmp_path):
+    """Hydra changes to the run directory first, where it is told to."""
+    (tmp_path / "link").symlink_to(first[0])
+    few = ("trainer.updates=3", "env.num_envs=64", "collector.frames_per_batch=128", "report=false")
+    code, text = cli(*QUICK, *few, "start=link", "hydra.job.chdir=true", "hydra.run.dir=run")
+    assert code == 0, text
+    assert load_config(tmp_path / "run").start == str(tmp_path / "link" / RunDirectory.LAST)
+
+
 def test_the_networks_have_the_settings_of_the_run_from_which_they_are(cli, tmp_path):
     """A setting that is typed stands."""
     other = tmp_path / "other"

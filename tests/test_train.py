@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import os
 import signal
@@ -12,11 +13,15 @@ from pathlib import Path
 import pytest
 import torch
 from omegaconf import OmegaConf
-from small import QUICK, command
+from small import QUICK, command, small_config
 
+import pirl_rl
 from pirl_rl import load_run, train
 from pirl_rl.commands import catalogue
+from pirl_rl.commands.train import prepare
 from pirl_rl.configuration import CONF, load_config
+from pirl_rl.lock import locked
+from pirl_rl.loggers import TorchRLLogger
 from pirl_rl.machine import read_sessions
 from pirl_rl.run_directory import RunDirectory
 
@@ -91,6 +96,15 @@ def test_figures_and_report_can_be_left_out(method, cli, tmp_path):
     assert not list(only_run(tmp_path).rglob("*.html"))
 
 
+def test_words_for_false_are_false():
+    """Hydra reads them as text, and every text counts as true in Python."""
+    words = {"check": "off", "compile": "no", "figures": "Off", "report": "n", "verbose": "off"}
+    config = small_config(*(f"{name}={word}" for name, word in words.items()))
+    prepare(config, [])
+    assert [config[name] for name in words] == [False] * 5
+    assert config.learner.compile is False
+
+
 def test_without_arguments_it_says_what_it_needs(cli, tmp_path):
     code, text = cli()
     assert code == 1
@@ -120,6 +134,24 @@ def test_every_choice_trains(setting, cli, tmp_path, monkeypatch):
         assert list(run.glob("tensorboard/events*"))
 
 
+def test_a_resumed_run_is_the_same_one_of_weights_and_biases(tmp_path, monkeypatch):
+    """The members of a population have ids of their own."""
+    for name in ("WANDB_API_KEY", "WANDB_CACHE_DIR"):
+        monkeypatch.setenv(name, "")
+    monkeypatch.setenv("NETRC", str(tmp_path / "absent"))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    ids = []
+    for folder, updates in (("one", 3), ("one", 6), ("other", 3)):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        logger = TorchRLLogger("wandb")
+        logger.open(tmp_path / folder, {"trainer": {"updates": updates}})
+        logger.log({"update": updates, "loss": 0.5})
+        ids.append(logger.logger.experiment.id)
+        logger.close()
+    assert ids[0] == ids[1] != ids[2]
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
@@ -133,7 +165,8 @@ def test_every_choice_trains(setting, cli, tmp_path, monkeypatch):
         (["critics=0"], "critics"),
         (["device=cuda"], "device"),
         (["device=tpu"], "device: expected auto, cpu or cuda"),
-        (["compile=maybe"], "learner.compile: expected bool"),
+        (["compile=maybe"], "compile: expected bool, got 'maybe'"),
+        (["figures=perhaps"], "figures: expected bool, got 'perhaps'"),
         (["logger._target_=os.system"], "logger._target_"),
         (["loss=td3"], "loss: expected settings with a _target_, got 'td3'"),
         (["critic.activation=Tnah"], "Tnah"),
@@ -184,6 +217,10 @@ def test_a_mistake_leaves_folders_elsewhere(cli, tmp_path_factory):
         (["+experiment=own"], "env.problem._target_: a value is missing"),
         (["resume=nope"], "nope is not a run directory"),
         (["resume=."], ". is not a run directory"),
+        (
+            ["resume=a", "resume=b"],
+            "resume=RUN_DIR once, the directory of a run to resume, got a and b",
+        ),
         (["+experiment=own", "env.problem._target_=drowned.MyProblem"], "expected a target outside"),
     ],
     ids=lambda value: value[-1] if isinstance(value, list) else "",
@@ -270,6 +307,32 @@ def test_a_run_is_never_overwritten(finished, cli):
     assert code == 1
     assert "no run overwrites files" in text
     assert RunDirectory(finished).config.read_bytes() == before
+
+
+def test_runs_that_begin_in_the_same_second_have_directories_of_their_own(cli, tmp_path, monkeypatch):
+    """On the command line and from Python, also where the first of them still runs; a refused one leaves nothing."""
+
+    class Stopped(datetime.datetime):
+        @classmethod
+        def now(cls, tz=None):
+            return cls(2026, 1, 31, 12)
+
+    monkeypatch.setattr("hydra.core.utils.datetime", Stopped)
+    few = (*QUICK, *SMALL, "trainer.updates=3", "report=false", "evaluation.during=[]")
+    running = tmp_path / "runs" / "reach1d" / "2026-01-31_12-00-00-0"
+    with locked(RunDirectory(running)):
+        assert cli(*few, "trainer.updates=-1")[0] == 1
+        code, text = cli(*few)
+        assert code == 0, text
+    settings = {"updates": 3, "debug": "default", "env.num_envs": 32, "report": False, "figures": False}
+    pirl_rl.train("reach1d", **settings, **{"evaluation.during": [], "evaluation.final": []})
+    assert sorted(path.name for path in running.parent.iterdir()) == [
+        running.name,
+        f"{running.name}-2",
+        f"{running.name}-3",
+    ]
+    assert not RunDirectory(running).config.exists()
+    assert [load_run(f"{running}-{number}").update for number in (2, 3)] == [3, 3]
 
 
 def test_sweep_goes_on_after_a_bad_job(cli, tmp_path):

@@ -55,10 +55,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-
-from pirl_rl.commands.console import program, reported
+from pirl_rl.building import trusted_modules
+from pirl_rl.commands.console import one_folder, program, read_settings, reported
 from pirl_rl.commands.report import draw_again
 from pirl_rl.errors import ConfigError, ProofError
 from pirl_rl.figures.files import save_figures
@@ -83,18 +81,17 @@ BOUNDS = ("lower", "upper")
 
 @program
 def main(arguments: Sequence[str]) -> None:
-    named = [item for item in arguments if item.startswith("run=")]
-    folder = Path(named[-1].partition("=")[2]) if named else Path()
+    with reported(Path()):
+        folder = one_folder(arguments, "run", "the directory of a finished run")
     with reported(folder):
-        if not named:
-            raise ConfigError("run: expected run=RUN_DIR, the directory of a finished run")
-        others = [item for item in arguments if item not in named]
+        others = [item for item in arguments if not item.startswith("run=")]
         methods = [item.partition("=")[2] for item in others if item.startswith("method=")]
         method = methods[-1] if methods else "statistical"
         settings = _settings(method, [item for item in others if not item.startswith("method=")])
-        trust = settings.pop("trust", ())
+        trust = trusted_modules(settings.pop("trust", None))
         run, directory = load_run(folder, trust), RunDirectory(folder)
         directory.refuse_links()
+        directory.require_writable()
         lines = _prove(run, directory, settings) if method == "interval" else _certify(run, directory, settings)
     print("\n".join(lines))
     if run.config.get("report", True):
@@ -214,7 +211,4 @@ def _settings(method: str, arguments: Sequence[str]) -> dict[str, Any]:
     for text in arguments:
         if "=" not in text or text.partition("=")[0] not in known:
             raise ConfigError(f"{text}: expected key=value with a key out of {', '.join(sorted(known))}")
-    try:
-        return OmegaConf.to_container(OmegaConf.from_dotlist([*arguments]))  # type: ignore[return-value]
-    except (OmegaConfBaseException, ValueError) as error:
-        raise ConfigError(f"certify: {error}") from None
+    return read_settings(arguments)

@@ -27,10 +27,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from pirl_rl.checking import Finding, check, examine, report
-from pirl_rl.commands.console import program, reported
+from pirl_rl.commands.console import program, read_settings, reported
 from pirl_rl.errors import ConfigError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str]) -> None:
                 "expected one argument without a sign of equality, the class of a problem, as in python -m "
                 f"pirl_rl.check my_module:MyProblem, got {' '.join(arguments) or 'nothing'}"
             )
-        settings: Any = OmegaConf.to_container(OmegaConf.from_dotlist([text for text in arguments if "=" in text]))
+        settings = read_settings([text for text in arguments if "=" in text])
         steps = {name: settings.pop(name) for name in ("dt", "substeps") if name in settings}
         problem = _problem(named[0], settings)
         started = time.perf_counter()

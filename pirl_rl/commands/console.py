@@ -15,16 +15,18 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import CompactHydraException, HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from pirl_rl.building import convert, trusted_modules
 from pirl_rl.errors import INTERRUPTED, ConfigError, Interrupted, PirlError
 from pirl_rl.places import is_users, users_frames
 from pirl_rl.progress import helped
 
-EXPECTED = (PirlError, HydraException, OmegaConfBaseException)
+EXPECTED = (PirlError, HydraException, OmegaConfBaseException, yaml.YAMLError)
 """Errors whose message alone tells the user what to correct."""
 
 UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM)
@@ -60,6 +62,9 @@ def program(function: Callable[[Sequence[str]], None]) -> Callable[..., None]:
 TRAINED = ("actor", "critic", "critics")
 """Groups of settings that cannot change in a run that is trained, since they are those of its networks."""
 
+SWITCHES = ("check", "compile", "verbose", "figures", "report")
+"""Settings of the commands that are true or false."""
+
 Meanings = Mapping[str, Mapping[str, str]]
 """What metrics mean, by the group of the table to which they belong and by metric."""
 
@@ -90,10 +95,40 @@ def metrics_table(summary: Mapping[str, float], meanings: Meanings) -> str:
     return "\n".join([*rows, ""])
 
 
-def named_modules(overrides: Sequence[str]) -> list[str]:
-    """The modules that the overrides name by a `_target_`."""
+def named_modules(overrides: Sequence[str], trust: str | Sequence[str] | None = ()) -> list[str]:
+    """The modules that a setting `trust` lists, and those that the overrides name by a `_target_`."""
     targets = [value for key, _, value in (item.partition("=") for item in overrides) if key.endswith("_target_")]
-    return [target.partition(".")[0] for target in targets]
+    return [*trusted_modules(trust), *(target.strip("'\"").partition(".")[0] for target in targets)]
+
+
+def one_folder(arguments: Sequence[str], key: str, meaning: str) -> Path:
+    """The folder that the only argument with a key names.
+
+    Raises:
+        ConfigError: if there is no such argument, or more than one, of which all others would be ignored.
+    """
+    named = [text.partition("=")[2] for text in arguments if text.startswith(f"{key}=")]
+    if len(named) != 1:
+        raise ConfigError(f"{key}: expected {key}=RUN_DIR once, {meaning}, got {' and '.join(named) or 'none'}")
+    return Path(named[0])
+
+
+def read_settings(arguments: Sequence[str]) -> dict[str, Any]:
+    """The settings of a command without a configuration, by their keys.
+
+    Args:
+        arguments: settings `key=value`, with values in YAML.
+
+    Raises:
+        ConfigError: with the argument that cannot be read.
+    """
+    settings = OmegaConf.create()
+    for text in arguments:
+        try:
+            settings.merge_with_dotlist([text])
+        except (OmegaConfBaseException, ValueError, yaml.YAMLError) as error:
+            raise ConfigError(f"{text}: expected key=value ({_first_line(str(error))})") from None
+    return OmegaConf.to_container(settings)  # type: ignore[return-value]
 
 
 def override(config: DictConfig, text: str) -> tuple[Any, Any]:
@@ -112,6 +147,19 @@ def override(config: DictConfig, text: str) -> tuple[Any, Any]:
     before = OmegaConf.select(config, parsed.key_or_group)
     OmegaConf.update(config, parsed.key_or_group, parsed.value())
     return before, parsed.value()
+
+
+def read_switches(config: DictConfig) -> None:
+    """Replace words for true and false, such as `off`, which Hydra reads as text.
+
+    Args:
+        config: the configuration of a run; changed in place.
+
+    Raises:
+        ConfigError: if one of `SWITCHES` is no such word.
+    """
+    for name in (name for name in SWITCHES if name in config):
+        config[name] = convert(config[name], bool, name)
 
 
 @contextlib.contextmanager
@@ -135,14 +183,13 @@ def reported(folder: Path, one_of_many: bool = False, again: Sequence[str] = ())
         raise SystemExit(INTERRUPTED) from None
     except EXPECTED as error:
         _end(f"error: {_one_line(error)}", one_of_many)
-    except OSError as error:
-        if error.errno not in UNWRITABLE:
-            traceback.print_exc()
-        _end(f"error: {error.strerror or error}: {error.filename or folder}", one_of_many)
     except Exception as error:
         place = _users_place(error)
-        if not place or os.environ.get("HYDRA_FULL_ERROR") == "1":
+        told = place or (isinstance(error, OSError) and error.errno in UNWRITABLE)
+        if not told or (place and os.environ.get("HYDRA_FULL_ERROR") == "1"):
             traceback.print_exc()
+        if isinstance(error, OSError) and not place:
+            _end(f"error: {error.strerror or error}: {error.filename or folder}", one_of_many)
         reason = error.msg if isinstance(error, SyntaxError) else str(error)  # whose text repeats the place
         _end(f"error: {type(error).__name__}: {_first_line(reason)}{place}", one_of_many)
 
@@ -157,6 +204,8 @@ def _end(message: str, one_of_many: bool) -> None:
 def _one_line(error: Exception) -> str:
     if isinstance(error, OmegaConfBaseException):
         return f"{error.full_key}: {_first_line(str(error.msg))}"
+    if isinstance(error, yaml.YAMLError):
+        return " ".join(str(error).split())  # the file and the line stand at its end
     return str(error)
 
 

@@ -45,13 +45,19 @@ def begin(
     return trainer
 
 
-def reopen(config: DictConfig, folder: Path, arguments: Sequence[str], trust: Sequence[str]) -> Trainer:
+def reopen(
+    config: DictConfig,
+    folder: Path,
+    arguments: Sequence[str],
+    trust: Sequence[str],
+    problem: ReachAvoidProblem | None = None,
+) -> Trainer:
     """The trainer of a run that was begun, at its last checkpoint, or at update 0 without one.
 
     Raises:
         PirlError: if the configuration cannot be built, or the checkpoint does not fit it.
     """
-    trainer = make_trainer(config, folder, trust)
+    trainer = make_trainer(config, folder, trust, problem)
     if RunDirectory(folder).last.exists():
         restore(trainer)
     elif any(RunDirectory(folder).checkpoints.glob("weights-*.pt")):
@@ -102,6 +108,33 @@ def show_run(
     if config.get("report", True):
         draw_again(run.path, trust, solution.problem)
     print(f"run      {run}")
+
+
+def own_directory(folder: Path) -> Path:
+    """The directory of a run whose user has named none: the one that the clock names, or another beside it.
+
+    Runs that begin in the same second have the same name. The first of them takes it, and the others take the first
+    that is free of <name>-2, <name>-3 and so on.
+
+    Args:
+        folder: the directory that the clock names, which may exist.
+
+    Returns:
+        A directory that no other run takes. It has a folder `.hydra` and no files.
+
+    Raises:
+        ConfigError: if a file lies in its place.
+    """
+    refuse_files(folder)
+    path, number = folder, 1
+    while True:
+        try:
+            # Of several processes that make one folder, the operating system lets a single one succeed.
+            (path / RunDirectory.CONFIG.parent).mkdir(parents=True)
+            return path
+        except FileExistsError:
+            number += 1
+            path = folder.with_name(f"{folder.name}-{number}")
 
 
 @contextlib.contextmanager

@@ -2,8 +2,8 @@
 
     python -m pirl_rl.evaluate run=RUN_DIR [key=value ...]
 
-Calls the final evaluators of the run, writes their metrics and the verdict to evaluation.json in the run directory, and
-draws its figures and its report.
+Calls the final evaluators of the run, writes their metrics and the verdict to evaluation.json in the run directory,
+with the settings of the problem, the simulator and the evaluators, and draws its figures and its report.
 
     run           the directory of a finished run
     verbose=true  prints all metrics with their meaning
@@ -21,10 +21,19 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from omegaconf import open_dict
+from omegaconf import OmegaConf, open_dict
 
 from pirl_rl.assembly import make_evaluation_simulator, make_evaluators, make_problem
-from pirl_rl.commands.console import TRAINED, named_modules, outcome, override, program, reported
+from pirl_rl.commands.console import (
+    TRAINED,
+    named_modules,
+    one_folder,
+    outcome,
+    override,
+    program,
+    read_switches,
+    reported,
+)
 from pirl_rl.commands.report import draw_again
 from pirl_rl.configuration import load_config
 from pirl_rl.errors import ConfigError
@@ -38,13 +47,10 @@ from pirl_rl.runs.load import load_run
 
 @program
 def main(arguments: Sequence[str]) -> None:
-    named = [item for item in arguments if item.startswith("run=")]
-    folder = Path(named[-1].partition("=")[2]) if named else Path()
-    run = RunDirectory(folder)
+    with reported(Path()):
+        folder = one_folder(arguments, "run", "the directory of a finished run")
     with reported(folder):
-        if not named:
-            raise ConfigError("run: expected run=RUN_DIR, the directory of a finished run")
-        overrides = [item for item in arguments if item not in named]
+        run, overrides = RunDirectory(folder), [text for text in arguments if not text.startswith("run=")]
         config = load_config(folder)
         config.trust = []
         with open_dict(config):
@@ -54,16 +60,20 @@ def main(arguments: Sequence[str]) -> None:
             if text.partition(".")[0] in TRAINED:
                 raise ConfigError(f"{text}: expected a setting of another group, since the networks are trained")
             override(config, text)
-        trust = [*config.trust, *named_modules(overrides)]
+        read_switches(config)
+        trust = named_modules(overrides, config.trust)
         evaluators = make_evaluators(config.evaluation, "final", trust)
         problem = make_problem(config, trust) if any(text.startswith("env.problem") for text in overrides) else None
         solution = load_run(folder, trust, device=config.device, problem=problem).solution
         run.refuse_links()
+        run.require_writable()
         announce(f"measuring: {', '.join(evaluators)}")
         evidence = evaluate(solution, make_evaluation_simulator(config, solution.problem), evaluators)
         metrics = metrics_of(evidence)
+        nodes = {"problem": config.env.problem} | {name: config.evaluation[name] for name in ("simulator", *evaluators)}
+        settings = {"settings": {name: OmegaConf.to_container(node, resolve=True) for name, node in nodes.items()}}
         with replacing(run.evaluation) as file:
-            file.write(json.dumps(statements_of(evidence) | metrics, indent=2) + "\n")
+            file.write(json.dumps(statements_of(evidence) | metrics | settings, indent=2) + "\n")
         figures = draw_run(solution, run.metrics, run.figures, evidence)
     meanings = meanings_of(evaluators, solution.problem)
     print(outcome(lines_of(evidence), metrics, meanings, config.verbose))

@@ -30,6 +30,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from pirl_rl import checkpoint
+from pirl_rl.building import trusted_modules
 from pirl_rl.checkpoint import TARGET
 from pirl_rl.commands.console import program, reported
 from pirl_rl.configuration import load_config, save_config
@@ -159,10 +160,5 @@ def main(arguments: Sequence[str]) -> None:
         if kind == "run":
             path = export(run, out)
         else:
-            path = export_model(run, out, kind, _modules(named.get("trust", "[]")))
+            path = export_model(run, out, kind, trusted_modules(named.get("trust")))
     print(f"written  {path}")
-
-
-def _modules(text: str) -> list[str]:
-    """The names in a list such as [my_module, other], with or without brackets."""
-    return [name.strip() for name in text.removeprefix("[").removesuffix("]").split(",") if name.strip()]

@@ -59,27 +59,24 @@ def train_population(
     """
     if config.grid is not None:
         raise ConfigError(f"{SEEDS}: expected null with method=grid, which draws no random numbers")
-    settings = _members(config)
+    _members(config)  # refuses wrong lists before anything is written
     choose(config, problem)  # once for all members
-    trainers, numbers, configs = [], [], []
-    with contextlib.ExitStack() as stack:
-        for name, own in zip(member_names(config), settings, strict=True):
-            path = folder / name
-            stack.enter_context(new_directory(path))
-            typed = [text for text in overrides if text.partition("=")[0].lstrip("+") not in (SEEDS, *own)]
-            typed += [f"{key}={_typed(value)}" for key, value in own.items()]
-            configs.append(_member_config(config, own))
-            trainers.append(begin(configs[-1], path, typed, trust, problem))
-            numbers.append(checkpoint.global_rng_states())
-        OmegaConf.save(list(overrides), RunDirectory(folder).overrides)
-        save_config(config, folder)
-        return _train(Population(trainers, numbers), configs, folder, trust)
+    # The configuration comes before the members, so that a population that is killed between them can be resumed.
+    OmegaConf.save(list(overrides), RunDirectory(folder).overrides)
+    save_config(config, folder)
+    return _train(config, folder, overrides, trust, problem)
 
 
 def resume_population(
-    config: DictConfig, folder: Path, overrides: Sequence[str], trust: Sequence[str]
+    config: DictConfig,
+    folder: Path,
+    overrides: Sequence[str],
+    trust: Sequence[str],
+    problem: ReachAvoidProblem | None = None,
 ) -> dict[str, float]:
     """Resume a population from the checkpoints of its members; returns the means of their summaries.
+
+    Members that a kill has left without a configuration begin.
 
     Raises:
         PirlError: as `train_population`, or if settings are to be changed.
@@ -88,15 +85,7 @@ def resume_population(
         raise ConfigError(
             f"{changed[0]}: expected no other settings for a population; a member alone can be resumed with them"
         )
-    trainers, numbers, configs = [], [], []
-    with contextlib.ExitStack() as stack:
-        for name in member_names(config):
-            path = folder / name
-            stack.enter_context(locked(RunDirectory(path)))
-            configs.append(load_config(path))
-            trainers.append(reopen(configs[-1], path, [f"resume={folder.name}"], trust))
-            numbers.append(checkpoint.global_rng_states())
-        return _train(Population(trainers, numbers), configs, folder, trust)
+    return _train(config, folder, OmegaConf.load(RunDirectory(folder).overrides), trust, problem)
 
 
 def member_names(config: DictConfig) -> list[str]:
@@ -149,6 +138,32 @@ def _typed(value: Any) -> str:
 
 
 def _train(
+    config: DictConfig,
+    folder: Path,
+    overrides: Sequence[str],
+    trust: Sequence[str],
+    problem: ReachAvoidProblem | None,
+) -> dict[str, float]:
+    """Begin the members, or reopen those that were begun, and train them; arguments are those of `train_population`."""
+    trainers, numbers, configs = [], [], []
+    with contextlib.ExitStack() as stack:
+        for name, own in zip(member_names(config), _members(config), strict=True):
+            path = folder / name
+            if RunDirectory(path).config.exists():
+                stack.enter_context(locked(RunDirectory(path)))
+                configs.append(load_config(path))
+                trainers.append(reopen(configs[-1], path, [f"resume={folder.name}"], trust, problem))
+            else:
+                stack.enter_context(new_directory(path))
+                typed = [text for text in overrides if text.partition("=")[0].lstrip("+") not in (SEEDS, *own)]
+                typed += [f"{key}={_typed(value)}" for key, value in own.items()]
+                configs.append(_member_config(config, own))
+                trainers.append(begin(configs[-1], path, typed, trust, problem))
+            numbers.append(checkpoint.global_rng_states())
+        return _finish(Population(trainers, numbers), configs, folder, trust)
+
+
+def _finish(
     population: Population, configs: Sequence[DictConfig], folder: Path, trust: Sequence[str]
 ) -> dict[str, float]:
     summaries = population.train()

@@ -23,6 +23,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from pirl_rl.building import trusted_modules
 from pirl_rl.commands.console import program, reported
 from pirl_rl.configuration import PACKAGE
 from pirl_rl.errors import ConfigError
@@ -42,14 +43,16 @@ def main(arguments: Sequence[str]) -> None:
             key, equals, value = text.partition("=")
             if key not in KEYS or not equals:
                 raise ConfigError(f"{text}: expected key=value with a key out of {', '.join(KEYS)}")
-            given[key] += _listed(value) if key != "out" else [value]
+            given[key] += _listed(value) if key == "run" else [value]
         folders, out = [Path(name) for name in given["run"]], [Path(name) for name in given["out"]]
         if not folders:
             raise ConfigError("run: expected run=RUN_DIR, the directory of a run")
         if len(folders) > 1 and not out:
             raise ConfigError(f"out: expected out=FILE for the report of {len(folders)} runs")
         announce("drawing the report")
-        path = write_report(folders, out[-1] if out else RunDirectory(folders[0]).report, given["trust"])
+        path = write_report(
+            folders, out[-1] if out else RunDirectory(folders[0]).report, trusted_modules(",".join(given["trust"]))
+        )
     print(f"written  {path}")
 
 

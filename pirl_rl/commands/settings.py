@@ -65,7 +65,7 @@ def typed_settings(
 
     Args:
         settings: values by keys with dots, or nested mappings.
-        config: the configuration, which must have each key unless the same mapping sets a new `_target_`.
+        config: the configuration, which must have each key unless a new `_target_` is set beside it.
         short: the node whose entries may be named without its name, such as "trainer".
         groups: names of groups, which the error message lists too.
 
@@ -73,6 +73,7 @@ def typed_settings(
         ConfigError: for an unknown key; the message lists the known ones.
     """
     texts = []
+    renewed = tuple(name.removesuffix("_target_") for name in settings if name.endswith("._target_"))
     for name, value in settings.items():
         first = name.partition(".")[0]
         if first in config.keys():
@@ -82,15 +83,19 @@ def typed_settings(
         else:
             known = sorted({*map(str, config), *(str(key) for key in config[short] if key != "_target_"), *groups})
             raise ConfigError(f"{name}: expected one of {', '.join(known)}")
-        texts += _texts(key, value, config)
+        texts += _texts(key, value, config, () if key.endswith("._target_") else renewed)
     return texts
 
 
-def _texts(key: str, value: Any, config: DictConfig, free: bool = False) -> list[str]:
-    """The override of a setting or, for a mapping, those of its entries; `free` allows keys that `config` lacks."""
+def _texts(key: str, value: Any, config: DictConfig, renewed: tuple[str, ...]) -> list[str]:
+    """The override of a setting or, for a mapping, those of its entries.
+
+    Keys that begin with one of `renewed`, the nodes with a new `_target_`, need not be in `config`.
+    """
     if isinstance(value, Mapping):
-        free = free or "_target_" in value
-        return [text for name, entry in value.items() for text in _texts(f"{key}.{name}", entry, config, free)]
+        renewed = (*renewed, f"{key}.") if "_target_" in value else renewed
+        return [text for name, entry in value.items() for text in _texts(f"{key}.{name}", entry, config, renewed)]
+    free = key.startswith(renewed)
     if not free:
         _check_key(key, config)
     return [f"{'++' if free else ''}{key}={_literal(value, key)}"]

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import to_absolute_path
 from omegaconf import DictConfig, OmegaConf
 
 from pirl_rl.configuration import load_config
@@ -36,6 +38,16 @@ def adopt_networks(config: DictConfig, typed: Sequence[str]) -> None:
         OmegaConf.update(config, name, OmegaConf.to_container(other[name], resolve=True), merge=False)
     for key, value in kept.items():
         OmegaConf.update(config, key, value, force_add=True)
+
+
+def absolute_start(config: DictConfig) -> None:
+    """Make a relative `start` absolute where Hydra has changed the directory, as `hydra.job.chdir=true` lets it.
+
+    Args:
+        config: the configuration of a command of Hydra; changed in place.
+    """
+    if HydraConfig.get().job.chdir and isinstance(config.start, str):
+        config.start = to_absolute_path(config.start)
 
 
 def take_start(trainer: Trainer, config: DictConfig) -> None:

@@ -31,12 +31,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from pirl_rl.assembly import make_problem
 from pirl_rl.commands.composition import compose
-from pirl_rl.commands.console import named_modules, program, reported
+from pirl_rl.commands.console import named_modules, program, read_settings, reported
 from pirl_rl.commands.train import go_on, refuse_other_settings, train_new
 from pirl_rl.errors import ConfigError
 from pirl_rl.figures import draw_suite, save_figures
@@ -106,11 +104,7 @@ def _options(arguments: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
         ConfigError: an option has a wrong type, or a problem is unknown.
     """
     own = [text for text in arguments if text.partition("=")[0] in DEFAULTS]
-    try:
-        given: Any = OmegaConf.to_container(OmegaConf.from_dotlist(own))
-    except (OmegaConfBaseException, ValueError) as error:
-        raise ConfigError(f"suite: {error}") from None
-    options = DEFAULTS | given
+    options = DEFAULTS | read_settings(own)
     for name in ("problems", "seeds", "against"):
         if not isinstance(options[name], list) or not (options[name] or name == "against"):
             raise ConfigError(f"{name}: expected a list such as {name}={DEFAULTS[name][:2]}, got {options[name]!r}")
@@ -211,7 +205,7 @@ def _score(folder: Path, name: str, overrides: Sequence[str], truth: Truth, roll
 
 def _trusted(typed: Sequence[str]) -> list[str]:
     """The modules that settings of this command allow a run to import, whatever the run's own configuration says."""
-    return [*compose("train", typed).trust, *named_modules(typed)]
+    return named_modules(typed, compose("train", typed).trust)
 
 
 def _alternative(

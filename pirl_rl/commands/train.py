@@ -35,12 +35,12 @@ from pirl_rl.assembly import make_problem
 from pirl_rl.commands.catalogue import choices
 from pirl_rl.commands.check import check_before_training
 from pirl_rl.commands.composition import check_overrides, drop_leftovers, register
-from pirl_rl.commands.console import named_modules, override, quiet_libraries, reported
-from pirl_rl.commands.directory import begin, new_directory, refuse_files, reopen, show
+from pirl_rl.commands.console import named_modules, one_folder, override, quiet_libraries, read_switches, reported
+from pirl_rl.commands.directory import begin, new_directory, own_directory, refuse_files, reopen, show
 from pirl_rl.commands.methods import check_method
 from pirl_rl.commands.population import resume_population, train_population
 from pirl_rl.commands.solve import solve
-from pirl_rl.commands.start import adopt_networks
+from pirl_rl.commands.start import absolute_start, adopt_networks
 from pirl_rl.configuration import CONF, PACKAGE, load_config
 from pirl_rl.errors import INTERRUPTED, ConfigError
 from pirl_rl.lock import locked
@@ -60,11 +60,15 @@ NOTHING_NAMED = """error: nothing to train was named, expected one of
 def train(config: DictConfig) -> float:
     """Train a new run in Hydra's run directory; returns the error that an optimising sweeper can minimise."""
     hydra_config = HydraConfig.get()
+    absolute_start(config)
     folder = Path(hydra_config.runtime.output_dir)
     overrides = hydra_config.overrides.task
-    foreign = dict.fromkeys(name for name in [*config.trust, *named_modules(overrides)] if name != PACKAGE.name)
+    foreign = dict.fromkeys(name for name in named_modules(overrides, config.trust) if name != PACKAGE.name)
     again = [f"trust=[{','.join(foreign)}]"] if foreign else []
     in_sweep = hydra_config.mode == RunMode.MULTIRUN
+    if not in_sweep and not _folders(hydra_config.overrides.hydra):
+        with reported(folder):
+            folder = own_directory(folder)
     with reported(folder, one_of_many=in_sweep, again=again):
         summary = (train_in_sweep if in_sweep else train_new)(config, folder, overrides)
     return summary.get("value_mse", summary.get("hjb_sup_loss", float("nan")))
@@ -84,7 +88,7 @@ def train_in_sweep(config: DictConfig, folder: Path, overrides: Sequence[str]) -
     if run.summary.exists():
         print(f"run      {run} is finished already", flush=True)
         return run.numbers()
-    return go_on(folder, [], [*config.trust, *named_modules(overrides)])
+    return go_on(folder, [], named_modules(overrides, config.trust))
 
 
 def refuse_other_settings(run: RunDirectory, overrides: Sequence[str], key: str) -> None:
@@ -152,9 +156,10 @@ def prepare(
         PirlError: with what was expected and what was got.
     """
     # Modules that the user names are trusted; those that a run directory names are not, since it may be foreign.
+    read_switches(config)
     check_method(config, overrides)
     adopt_networks(config, overrides)
-    modules = [*config.trust, *named_modules(overrides), *trust]
+    modules = [*named_modules(overrides, config.trust), *trust]
     drop_leftovers(config, overrides, modules)
     problem = make_problem(config, modules) if problem is None else problem
     if config.check:
@@ -169,13 +174,16 @@ def resume(folder: Path, overrides: Sequence[str]) -> None:
         go_on(folder, overrides)
 
 
-def go_on(folder: Path, overrides: Sequence[str], trust: Sequence[str] = ()) -> dict[str, float]:
+def go_on(
+    folder: Path, overrides: Sequence[str], trust: Sequence[str] = (), problem: ReachAvoidProblem | None = None
+) -> dict[str, float]:
     """Resume a run; returns the summary.
 
     Args:
         folder: the run directory.
         overrides: overrides `key=value` that change its configuration for good. The modules that they name are trusted.
         trust: further modules outside the package that the configuration may name.
+        problem: replaces `env.problem`, for a run that was trained on an object.
 
     Raises:
         PirlError: if the run cannot be resumed, or training diverges or is interrupted.
@@ -189,8 +197,9 @@ def go_on(folder: Path, overrides: Sequence[str], trust: Sequence[str] = ()) -> 
             for text in overrides:
                 if text.startswith("trust="):
                     override(config, text)
-            return resume_population(config, folder, overrides, [*config.trust, *named_modules(overrides), *trust])
-    with reopened(folder, overrides, trust) as (trainer, config, modules):
+            modules = [*named_modules(overrides, config.trust), *trust]
+            return resume_population(config, folder, overrides, modules, problem)
+    with reopened(folder, overrides, trust, problem) as (trainer, config, modules):
         summary = trainer.train()
         show(trainer, summary, config, modules)
         return summary
@@ -198,7 +207,7 @@ def go_on(folder: Path, overrides: Sequence[str], trust: Sequence[str] = ()) -> 
 
 @contextlib.contextmanager
 def reopened(
-    folder: Path, overrides: Sequence[str], trust: Sequence[str] = ()
+    folder: Path, overrides: Sequence[str], trust: Sequence[str] = (), problem: ReachAvoidProblem | None = None
 ) -> Iterator[tuple[Trainer, DictConfig, list[str]]]:
     """Open a run to go on with it; arguments and errors are those of `go_on`.
 
@@ -219,10 +228,11 @@ def reopened(
                 )
             if before != after and not text.startswith("trust="):  # which counts for this command alone
                 print(f"resume: {text.partition('=')[0]} was {before}, and is {after} from now on", flush=True)
+        read_switches(config)
         if config.get("grid") is not None:
             raise ConfigError(f"resume: expected a run that was trained, but {folder} holds the solution of a grid")
-        modules = [*config.trust, *named_modules(overrides), *trust]
-        yield reopen(config, folder, [f"resume={folder.name}", *overrides], modules), config, modules
+        modules = [*named_modules(overrides, config.trust), *trust]
+        yield reopen(config, folder, [f"resume={folder.name}", *overrides], modules, problem), config, modules
 
 
 def _folders(arguments: Sequence[str]) -> list[Path]:
@@ -242,7 +252,8 @@ def main() -> None:
     resumed = [item for item in arguments if item.startswith("resume=") and item != "resume=null"]
     try:
         if resumed:
-            folder = Path(resumed[-1].partition("=")[2])
+            with reported(Path()):
+                folder = one_folder(resumed, "resume", "the directory of a run to resume")
             resume(folder, [item for item in arguments if item not in resumed])
         else:
             with reported(Path()):

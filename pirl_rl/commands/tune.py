@@ -40,7 +40,7 @@ from pirl_rl.commands.baseline import measure
 from pirl_rl.commands.composition import OTHER_FOLDERS, check_overrides, compose, drop_leftovers, register
 from pirl_rl.commands.console import named_modules, quiet_libraries, reported
 from pirl_rl.commands.loop_settings import counts_of, overrides_of_training, readable
-from pirl_rl.commands.start import adopt_networks
+from pirl_rl.commands.start import absolute_start, adopt_networks
 from pirl_rl.configuration import CONF
 from pirl_rl.continuation import start_from
 from pirl_rl.errors import INTERRUPTED, ConfigError
@@ -67,6 +67,7 @@ JUDGES = ("success", "residuals", "calibration")
 def tune(config: DictConfig) -> None:
     """Start or resume the loop in `out`."""
     typed = HydraConfig.get().overrides.task
+    absolute_start(config)
     out = Path(HydraConfig.get().runtime.output_dir)
     with reported(out), _tidy(out), _resumable(out):
         counts = counts_of(config)
@@ -75,7 +76,7 @@ def tune(config: DictConfig) -> None:
                 f"parallel: expected 1 with population=true, which is one process, got {counts['parallel']}"
             )
         train = overrides_of_training(config, typed)
-        trust = [*config.trust, *named_modules(typed)]
+        trust = named_modules(typed, config.trust)
         advisor = build(config.advisor, "advisor", trust)
         trainer, path, final = _first(config, train, trust)
         config.start = str(path)

@@ -150,7 +150,7 @@ class Contents:
             key
             for file in (RunDirectory.SUMMARY, RunDirectory.EVALUATION)
             for key, value in self.files.get(str(file), {}).items()
-            if not isinstance(value, str)
+            if not isinstance(value, (str, dict))  # words, and the settings of the evaluators
         )
         known = {name for group in self.meanings.values() for name in group}
         groups = {**self.meanings, "run": {name: "" for name in names if name not in known}}

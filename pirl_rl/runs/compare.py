@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -111,7 +112,7 @@ def read_run(path: Path) -> RunRecord:
         names = [OmegaConf.select(config, key, throw_on_missing=True) for key in ("experiment_name", "method_name")]
         summary = run.numbers()
         metrics = read_metrics(run.metrics) if run.metrics.is_file() else {}
-    except (OSError, ValueError, OmegaConfBaseException) as error:
+    except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException) as error:
         raise RunError(f"{path} cannot be read: {error}") from error
     if None in names:
         raise RunError(f"{run.config}: expected the keys experiment_name and method_name")

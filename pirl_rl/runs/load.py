@@ -8,6 +8,7 @@ from typing import cast
 
 from pirl_rl import checkpoint
 from pirl_rl.assembly import make_networks, make_problem
+from pirl_rl.building import trusted_modules
 from pirl_rl.checkpoint import check_module
 from pirl_rl.configuration import load_config
 from pirl_rl.continuation import fitting
@@ -22,7 +23,7 @@ from pirl_rl.solution import Solution
 
 def load_run(
     folder: str | PathLike[str],
-    trust: Sequence[str] = (),
+    trust: Sequence[str] | str = (),
     weights: str | None = None,
     device: str = "cpu",
     problem: ReachAvoidProblem | None = None,
@@ -31,7 +32,8 @@ def load_run(
 
     Args:
         folder: a directory that training or `python -m pirl_rl.export` wrote.
-        trust: modules outside pirl_rl that its configuration may name, such as the module of your own problem.
+        trust: modules outside pirl_rl that its configuration may name, such as the module of your own problem;
+            a list or one name.
         weights: name of a file in `checkpoints/`; the default is the latest.
         device: device of the networks.
         problem: replaces `env.problem`, for a run that was trained on an object, which no configuration can name.
@@ -42,6 +44,7 @@ def load_run(
             problem.
         CheckpointError: if the checkpoint is missing, broken or does not fit the configuration.
     """
+    trust = trusted_modules(trust)
     if not isinstance(folder, (str, PathLike)):
         raise ArgumentError(f"folder: expected the path of a run directory, got {folder!r}")
     if not (problem is None or isinstance(problem, ReachAvoidProblem)):
