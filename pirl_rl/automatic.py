@@ -18,9 +18,8 @@ from pirl_rl.time_steps import STEPS, check_time_steps, propose_time_steps
 AUTO = "auto"
 """The value that leaves a choice to the package.
 
-Keys that take it: env.dt, env.substeps, env.num_envs, collector.frames_per_batch, collector.warmup_frames,
-collector.buffer_size, collector.n_steps, n_steps of a stage, trainer.updates, actor.choices, actor.together,
-loss.hjb_probes and the entries of `PATHS`.
+Keys that take it: env.dt, env.substeps, env.num_envs, collector.n_steps, n_steps of a stage, trainer.updates,
+actor.choices, actor.together, loss.hjb_probes and the entries of `PATHS`.
 """
 
 UPDATES_PER_DIMENSION, FEW_STATES, UPDATES_OF_MANY = 2_300, 3, 2_900
@@ -37,15 +36,6 @@ The number of updates that is chosen, times this sum, is at most MOST_COST.
 
 PLAYED_PATHS, RETURN_STEPS = 2_048, 10
 """The number of paths that are played, and the steps of their returns, with up to `STEPS[0]` control steps."""
-
-FRAMES = {"frames_per_batch": 102_400, "warmup_frames": 102_400, "buffer_size": 204_800}
-"""Numbers of transitions, by key of the collector, with up to `STEPS[0]` control steps.
-
-A batch is 50 steps of each path. The buffer holds two batches, since older ones come from another policy.
-"""
-
-MOST_FRAMES = 4
-"""The largest multiple of `FRAMES` that is chosen, because of time and memory."""
 
 PATHS = {
     ("success", "episodes"): (10_000, 1_000),
@@ -92,21 +82,16 @@ def choose_time_steps(config: DictConfig, problem: ReachAvoidProblem) -> None:
 
 
 def choose_playing(config: DictConfig, problem: ReachAvoidProblem) -> None:
-    """Replace `auto` in env.num_envs, in the collector's numbers and in n_steps of the stages by numbers.
+    """Replace `auto` in env.num_envs, collector.n_steps and n_steps of the stages by numbers.
 
-    With k times as many control steps a batch has k times as many transitions, so that paths advance as far between two
-    updates, and returns have k times as many steps. Beyond `MOST_FRAMES` fewer paths are played instead. A stage has
-    returns of twice the steps of those of the run.
+    With twice as many control steps half as many paths are played, so that they advance as far between two updates, and
+    returns have twice as many steps. A stage has twice the steps of the run.
     """
     steps = problem.horizon / config.env.get("dt", Simulator.dt)
-    # Powers of two, since the number of paths has to divide collector.frames_per_batch.
+    # A power of two, since the number of paths has to divide collector.frames_per_batch.
     stretch = 2 ** round(math.log2(max(1.0, steps / STEPS[0])))
-    frames = min(stretch, MOST_FRAMES)
     if config.env.get("num_envs") == AUTO:
-        config.env.num_envs = max(1, PLAYED_PATHS * frames // stretch)
-    for name, number in FRAMES.items():
-        if config.collector.get(name) == AUTO:
-            config.collector[name] = number * frames
+        config.env.num_envs = max(1, PLAYED_PATHS // stretch)
     # The collector may refer to the settings of the method, which a resumed run may change.
     for node in (config.get("pirl"), config.collector):
         if node is not None and node.get("n_steps") == AUTO:

@@ -301,24 +301,21 @@ def test_a_number_beside_auto_is_kept(capsys):
 
 
 @pytest.mark.parametrize(
-    ("typed", "paths", "batch", "returns"),
+    ("typed", "numbers"),
     [
-        ([], 2_048, 102_400, (10, 20)),
-        (["env.dt=0.0025"], 2_048, 204_800, (20, 40)),
-        (["env.dt=0.00125"], 2_048, 409_600, (40, 80)),
-        (["env.dt=0.0003125"], 512, 409_600, (160, 320)),
-        (["env.dt=0.3"], 2_048, 102_400, (10, 20)),
-        (["env.dt=0.00125", "pirl.n_steps=4", "env.num_envs=64"], 64, 409_600, (4, 8)),
+        ([], (2_048, 10, 20)),
+        (["env.dt=0.0025"], (1_024, 20, 40)),
+        (["env.dt=0.00125"], (512, 40, 80)),
+        (["env.dt=0.3"], (2_048, 10, 20)),
+        (["env.dt=0.00125", "pirl.n_steps=4", "env.num_envs=64"], (64, 4, 8)),
     ],
 )
-def test_paths_advance_as_far_between_updates_with_short_control_steps(typed, paths, batch, returns):
+def test_paths_advance_as_far_between_updates_with_short_control_steps(typed, numbers):
     config = own(*typed)
     choose_time_steps(config, Safety1D())
     choose_playing(config, Safety1D())
-    collector = config.collector
-    assert (config.env.num_envs, collector.frames_per_batch) == (paths, batch)
-    assert (collector.n_steps, config.stages[1].n_steps) == returns
-    assert (collector.warmup_frames, collector.buffer_size) == (batch, 2 * batch)
+    assert (config.env.num_envs, config.collector.n_steps, config.stages[1].n_steps) == numbers
+    assert config.collector.frames_per_batch % config.env.num_envs == 0
 
 
 @pytest.mark.parametrize(
