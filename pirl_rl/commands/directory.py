@@ -28,7 +28,7 @@ from pirl_rl.trainer import Trainer
 
 
 def begin(
-    config: DictConfig, folder: Path, overrides: Sequence[str], trust: Sequence[str], problem: ReachAvoidProblem
+    config: DictConfig, folder: Path, overrides: Sequence[str], trust: Sequence[str], problem: ReachAvoidProblem | None
 ) -> Trainer:
     """The trainer of a new run, whose configuration and overrides are saved in its directory.
 

@@ -85,7 +85,8 @@ def resume_population(
         raise ConfigError(
             f"{changed[0]}: expected no other settings for a population; a member alone can be resumed with them"
         )
-    return _train(config, folder, OmegaConf.load(RunDirectory(folder).overrides), trust, problem)
+    typed = [str(text) for text in OmegaConf.load(RunDirectory(folder).overrides)]
+    return _train(config, folder, typed, trust, problem)
 
 
 def member_names(config: DictConfig) -> list[str]:
