@@ -10,6 +10,7 @@ the physics is written down; networks, environments and integration are elsewher
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -210,6 +211,13 @@ class ReachAvoidProblem(ABC):
 def closed_form(problem: ReachAvoidProblem, tau: Tensor, x: Tensor) -> Tensor | None:
     """V (*) by `exact_value`, which is about the indicator; None where it is not known, and for a smoothed payoff."""
     return problem.exact_value(tau, x) if problem.payoff.epsilon == 0 else None
+
+
+def with_indicator(problem: ReachAvoidProblem) -> ReachAvoidProblem:
+    """A copy of the problem whose payoff is the indicator, so that to come to A itself is a success."""
+    hard = copy.copy(problem)
+    hard.payoff = Indicator()
+    return hard
 
 
 def _normalized(levels, x: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from pirl_rl.errors import ProofError
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.grid import GridSolver
 from pirl_rl.networks import Actor
+from pirl_rl.payoffs import LipschitzPayoff
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems import (
     DoubleIntegrator,
@@ -332,6 +333,19 @@ def test_a_proved_bound_is_below_the_exact_probability_and_near(problem):
     known = problem.exact_value(torch.tensor([problem.horizon]), torch.zeros(1, 1)).item()
     assert known - 0.06 < start < known
     assert_no_point_violates(proof, solution, 1_000_000)
+
+
+def test_a_smoothed_payoff_leaves_the_proof_as_it_is(tmp_path):
+    """The hard sets count, and a file is read for either payoff."""
+    smoothed, settings = Reach1D(payoff=LipschitzPayoff(0.3)), Settings(cells=16, steps=16)
+    proof, hard = (prove_success(Stand(problem, constant(1.0)), "none", settings) for problem in (smoothed, Reach1D()))
+    assert proof.holds
+    points = np.full(4, 2.0), np.array([[-1.0], [0.0], [1.0], [1.9]])
+    assert (proof.bound(*points) == hard.bound(*points)).all()
+    assert proof.to_dict() | {"seconds": 0} == hard.to_dict() | {"seconds": 0}
+    proof.save(tmp_path / "proof.npz")
+    for problem in (smoothed, Reach1D()):
+        assert LowerBound.load(tmp_path / "proof.npz", problem, "none").to_dict()["mean"] == hard.to_dict()["mean"]
 
 
 def test_an_invariance_problem_is_proved():

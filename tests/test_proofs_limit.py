@@ -13,6 +13,7 @@ from torch import Tensor
 from pirl_rl import certify, load_run
 from pirl_rl.errors import ProofError
 from pirl_rl.grid import GridSolver
+from pirl_rl.payoffs import SmoothPayoff
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems import DoubleIntegrator, DubinsCar, Exit1D, HalfSpace, Pendulum, Reach1D, Safety1D
 from pirl_rl.proofs import LowerBound, Settings, UpperBound, prove_limit
@@ -96,6 +97,13 @@ def test_an_upper_bound_is_above_the_exact_probability_and_near(problem, cells, 
     known = problem.exact_value(torch.tensor([problem.horizon]), torch.zeros(1, 1)).item()
     assert known < middle < known + near
     assert_no_control_violates(limit, 1_000_000)
+
+
+def test_a_smoothed_payoff_leaves_the_limit_as_it_is():
+    """States in A that are not in A_eps succeed, so that nothing is said of them."""
+    settings = Settings(cells=16, steps=16)
+    limit, hard = (prove_limit(problem, settings) for problem in (Reach1D(payoff=SmoothPayoff(0.3)), Reach1D()))
+    assert limit.to_dict() | {"seconds": 0} == hard.to_dict() | {"seconds": 0}
 
 
 def test_an_invariance_problem_has_an_upper_bound():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -14,7 +13,7 @@ from torch import Tensor
 from pirl_rl.checkpoint import digest
 from pirl_rl.evaluation.inputs import like, noise_rng, points_rng
 from pirl_rl.evaluation.monte_carlo import mean_payoff
-from pirl_rl.payoffs import Indicator
+from pirl_rl.problem import with_indicator
 from pirl_rl.sampling.initial_states import InitialStates
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
@@ -98,9 +97,8 @@ class Deployed:
     """
 
     def __init__(self, solution: Solution, simulator: Simulator):
-        problem = copy.copy(solution.problem)
-        problem.payoff = Indicator()
-        self.solution, self.simulator = solution, dataclasses.replace(simulator, problem=problem)
+        self.solution = solution
+        self.simulator = dataclasses.replace(simulator, problem=with_indicator(solution.problem))
 
     def successes(self, tau: Tensor, x: Tensor, rollouts: int, rng: torch.Generator) -> np.ndarray:
         """The numbers of successes (N,) out of so many independent paths from each start, tau (N,) and x (N, n)."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 
 import torch
@@ -13,8 +12,7 @@ from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.evaluator import Metrics
 from pirl_rl.evaluation.inputs import points_rng
 from pirl_rl.evaluation.monte_carlo import mean_payoff, wilson_interval
-from pirl_rl.payoffs import Indicator
-from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.problem import ReachAvoidProblem, with_indicator
 from pirl_rl.sampling.initial_states import InitialStates, UniformStates
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
@@ -61,9 +59,8 @@ class Success:
         tau, x = clock.time(steps).to(solution.device, solution.dtype), x.to(solution.device)
         reward = rate = self._mean(simulator, solution.policy, tau, x)
         if problem.payoff.epsilon > 0:
-            hard = copy.copy(problem)
-            hard.payoff = Indicator()
-            rate = self._mean(dataclasses.replace(simulator, problem=hard), solution.policy, tau, x)
+            hard = dataclasses.replace(simulator, problem=with_indicator(problem))
+            rate = self._mean(hard, solution.policy, tau, x)
         low, high = wilson_interval(rate * self.episodes, self.episodes)
         metrics = {
             "success_rate": rate,

@@ -13,7 +13,7 @@ from pirl_rl.evaluation.inputs import like
 from pirl_rl.evaluation.planes import planes_of
 from pirl_rl.evaluation.slices import Section
 from pirl_rl.figures.planes import CONTOURS, draw_sets
-from pirl_rl.problem import ReachAvoidProblem, closed_form
+from pirl_rl.problem import closed_form
 from pirl_rl.proofs import LowerBound, UpperBound
 from pirl_rl.solution import Solution
 
@@ -44,7 +44,7 @@ def _curve(solution: Solution, bounds: Sequence[Bound]) -> Figure:
     if exact is not None:
         axes.plot(x[:, 0], exact, "k--", linewidth=1, label="exact V")
     for bound in bounds:
-        values, lower = _values(problem, bound, tau, x), isinstance(bound, LowerBound)
+        values, lower = _values(bound, tau, x), isinstance(bound, LowerBound)
         style = ("tab:green", "proved of the policy") if lower else ("tab:red", "out of reach of all policies")
         axes.fill_between(x[:, 0], 0 if lower else 1, values, alpha=0.3, color=style[0], label=style[1])
     axes.set(title=f"Proved success, τ = {problem.horizon:g} s", xlabel="state x (SI)", ylabel="probability")
@@ -57,7 +57,7 @@ def _map(solution: Solution, bounds: Sequence[Bound], section: Section) -> Figur
     first, second = (axis.numpy() for axis in section.axes)
     shown = {"Learned V": section.value.numpy()}
     for bound in bounds:
-        values = _values(solution.problem, bound, section.tau.cpu().double(), section.x.cpu().double())
+        values = _values(bound, section.tau.cpu().double(), section.x.cpu().double())
         name = "Proved success" if isinstance(bound, LowerBound) else "No policy succeeds with more"
         shown[name] = values.reshape(section.value.shape)
     # What is proved from below stands left of V, and what is proved from above right of it.
@@ -74,8 +74,9 @@ def _map(solution: Solution, bounds: Sequence[Bound], section: Section) -> Figur
     return figure
 
 
-def _values(problem: ReachAvoidProblem, bound: Bound, tau: Tensor, x: Tensor) -> np.ndarray:
+def _values(bound: Bound, tau: Tensor, x: Tensor) -> np.ndarray:
     """The bound (N,), 1 in A and 0 in B, and outside the box what is known without a proof."""
+    problem = bound.problem
     values = np.full(len(x), 0.0 if isinstance(bound, LowerBound) else 1.0)
     inside = problem.states.contains(x) & problem.interior(x)
     values[inside.numpy()] = bound.bound(tau[inside].numpy(), x[inside].numpy())

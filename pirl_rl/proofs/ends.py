@@ -44,7 +44,7 @@ class Ends:
     """The sets in which paths end, and the values that W must not exceed there.
 
     Attributes:
-        problem: the physics.
+        problem: the physics, with the indicator as its payoff.
         success: whether W bounds the probability of success; otherwise it bounds that of failure.
     """
 
@@ -82,11 +82,8 @@ class Ends:
         return self.avoid(torch.zeros(1, problem.states.dim, dtype=torch.float64)).shape[-1] > 1
 
     def target(self, x: Any) -> Any:
-        """Levels (N, k) at states (N, n), tensors or affine forms, whose intersection is A.
-
-        With a smoothed payoff, success is to come to the smaller A_eps, and failure is not even to come to A.
-        """
-        return self.problem.reached_constraints(x) if self.success else self.problem.free_target_constraints(x)
+        """Levels (N, k) at states (N, n), tensors or affine forms, whose intersection is A."""
+        return self.problem.free_target_constraints(x)
 
     def avoid(self, x: Any) -> Any:
         """Levels (N, k) at states (N, n), tensors or affine forms, whose union is B."""

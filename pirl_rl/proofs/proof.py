@@ -14,7 +14,7 @@ import torch
 
 from pirl_rl.errors import ProofError
 from pirl_rl.files import replacing
-from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.problem import ReachAvoidProblem, with_indicator
 from pirl_rl.proofs.boxes import Boxes
 from pirl_rl.proofs.spline import Spline
 
@@ -45,7 +45,7 @@ class Proof(ABC):
     """W - margin, a lower bound of a probability under continuous feedback.
 
     Attributes:
-        problem: the problem.
+        problem: the problem, with the indicator as its payoff: the hard sets count.
         spline: W.
         margin: what is taken from W, so that no condition fails.
         resisted: the boxes on which a condition holds with this margin only, by the name of the condition.
@@ -150,7 +150,7 @@ class Proof(ABC):
                 f"{path}: it proves something about a problem with other drift, noise, sets, controls or horizon than "
                 f"{type(problem).__name__}; prove again with {cls.COMMAND}"
             )
-        fields = {"problem": problem, "spline": spline, "margin": margin, "resisted": {}}
+        fields = {"problem": with_indicator(problem), "spline": spline, "margin": margin, "resisted": {}}
         return fields | {"boxes": int(boxes), "seconds": seconds}, subjects
 
 

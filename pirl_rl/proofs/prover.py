@@ -15,7 +15,7 @@ from torch import Tensor
 from pirl_rl.arguments import check_integer
 from pirl_rl.errors import ProofError
 from pirl_rl.grid import GridSolver
-from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.problem import ReachAvoidProblem, with_indicator
 from pirl_rl.progress import announce
 from pirl_rl.proofs.affine import Affine
 from pirl_rl.proofs.boxes import Boxes
@@ -112,8 +112,7 @@ def prove_success(solution: Solution, networks: str, settings: Settings | None =
             "proof: expected a continuous policy, as with actor.choices=null, got one that chooses among "
             f"{choice.choices} numbers"
         )
-    _check(solution.problem)
-    policy = _policy(solution)
+    problem, policy = _provable(solution.problem), _policy(solution)
 
     def feedback(z: Any) -> Any:
         return policy(z[:, 0], z[:, 1:])
@@ -121,7 +120,7 @@ def prove_success(solution: Solution, networks: str, settings: Settings | None =
     def rates_at(points: States) -> PolicyRates:
         return PolicyRates(points, policy)
 
-    claim = Claim(Ends(solution.problem, True), policy, rates_at, feedback, [])
+    claim = Claim(Ends(problem, True), policy, rates_at, feedback, [])
     return LowerBound(networks=networks, **_prove(claim, settings))
 
 
@@ -135,7 +134,7 @@ def prove_limit(problem: ReachAvoidProblem, settings: Settings | None = None) ->
     Raises:
         ProofError: there are too many states or periodic ones, or a function has no enclosure.
     """
-    _check(problem)
+    problem = _provable(problem)
     announce("solving on a grid")
     # W is fitted to a policy that is nearly the best. The proof does not depend on it. The policy of drift and noise in
     # turns does not suit the fit: on the pendulum W cannot be raised to where it violates nothing.
@@ -148,11 +147,13 @@ def prove_limit(problem: ReachAvoidProblem, settings: Settings | None = None) ->
     return UpperBound(**_prove(Claim(Ends(problem, False), policy, LeastRates, feedback, controls), settings))
 
 
-def _check(problem: ReachAvoidProblem) -> None:
+def _provable(problem: ReachAvoidProblem) -> ReachAvoidProblem:
+    """The problem with its hard sets, if it has few enough states and none is periodic."""
     if problem.states.dim > MOST_STATES:
         raise ProofError(f"proof: expected at most {MOST_STATES} states, got {problem.states.dim}")
     if problem.states.periodic:
         raise ProofError("proof: expected no periodic coordinates")
+    return with_indicator(problem)
 
 
 def _prove(claim: Claim, settings: Settings | None) -> dict[str, Any]:
