@@ -47,6 +47,7 @@ MATRIX = torch.tensor([[0.5, -1.0], [2.0, 0.25]], dtype=torch.float64)
 
 FUNCTIONS = {
     "abs": lambda z: z.abs(),
+    "abs of Python": lambda z: abs(z - 0.2),
     "atan": torch.atan,
     "cos": torch.cos,
     "exp": torch.exp,
@@ -71,6 +72,11 @@ FUNCTIONS = {
     "row times matrix": lambda z: (torch.stack([z, z.sin()], -1) @ MATRIX)[..., 1],
     "row times vector": lambda z: torch.stack([z, z.sin()], -1) @ MATRIX[0],
     "matrix times column": lambda z: (MATRIX @ torch.stack([z, z.sin()], -1).unsqueeze(-1))[..., 1, 0],
+    "where": lambda z: torch.where(z > 0.3, z.sin(), 2 - z),
+    "where of numbers": lambda z: torch.where((z > -1) & ~(z >= 0.5) | (z > 2), 1.0, -0.5),
+    "indicator": lambda z: z * (z < 0.3) + torch.sign(z),
+    "root": lambda z: (z + 4) ** 0.5 - z**2.0,
+    "numbers of numpy": lambda z: np.float64(2) * z - z / np.float64(3),
     "vector norm": lambda z: torch.linalg.vector_norm(torch.stack([z, 2 * z + 1], -1), dim=-1),
 }
 
@@ -135,12 +141,48 @@ def test_a_policy_and_the_physics_are_enclosed(problem):
     assert_encloses(rates(Affine.of_box(centre, half)), rates, centre, half, rng)
 
 
+def test_a_number_stands_in_for_a_form_of_several_coordinates():
+    rng = torch.Generator().manual_seed(6)
+    centre, half = random_boxes(300, 2, 1.0, rng)
+    chosen = torch.rand(300, 1, generator=rng) < 0.5
+
+    def function(z):
+        return torch.where(chosen, z[:, :1], 0.5) + torch.where(z[:, 1:] > z[:, :1], 1.0, 0.0)
+
+    form = function(Affine.of_box(centre, half))
+    assert form.slopes.shape == (2, 300, 1)
+    assert_encloses(form, function, centre, half, rng)
+
+
 def test_an_unknown_function_is_refused():
     form = Affine.of_box(torch.zeros(1, 1, dtype=torch.float64), torch.ones(1, 1, dtype=torch.float64))
     with pytest.raises(ProofError, match=r"torch\.erf: no enclosure"):
         torch.erf(form)
     with pytest.raises(ProofError, match="sqrt: its argument is not positive"):
         form.sqrt()
+
+
+@pytest.mark.parametrize(
+    ("function", "name"),
+    [
+        (lambda z: z * (z == 0), "torch.eq"),
+        (lambda z: z % 1.0, "torch.mod"),
+        (lambda z: 2.0**z, "torch.rpow"),
+        (lambda z: z.T, "torch.T"),
+        (lambda z: torch.add(z, z, alpha=2), "torch.add"),
+        (lambda z: z.sum(axis=-1), "torch.sum"),
+        (lambda z: z.__setitem__(0, 1.0), "torch.setitem"),
+        (lambda z: torch.zeros(1).__setitem__(0, z), "torch.setitem"),
+        (lambda z: torch.sin(z) if z > 0 else z, "if"),
+        (lambda z: z.add_(1.0), "torch.add_"),
+        (lambda z: [*z], "torch.iter"),
+        (lambda z: np.arcsin(z), "torch.arcsin"),
+    ],
+)
+def test_an_operation_without_an_enclosure_is_named(function, name):
+    form = Affine.of_box(torch.zeros(1, 1, dtype=torch.float64), torch.ones(1, 1, dtype=torch.float64))
+    with pytest.raises(ProofError, match=rf"^{name}: .*enclosure"):
+        function(form)
 
 
 def random_spline(seed: int) -> tuple[Spline, NdBSpline]:
@@ -333,6 +375,22 @@ def test_a_proved_bound_is_below_the_exact_probability_and_near(problem):
     known = problem.exact_value(torch.tensor([problem.horizon]), torch.zeros(1, 1)).item()
     assert known - 0.06 < start < known
     assert_no_point_violates(proof, solution, 1_000_000)
+
+
+class Switched(Reach1D):
+    """Reach1D with a drift that is |u| below x = -1: under u > 0 it is the same."""
+
+    def drift(self, x, u):
+        return torch.where(x < -1, abs(u), u)
+
+
+def test_a_drift_that_switches_is_proved():
+    proof = prove_success(Stand(Switched(), constant(1.0)), "none", Settings(cells=32, steps=32))
+    x = np.linspace(-1.9, 1.9, 50)[:, None]
+    exact = Reach1D().exact_value(torch.full((50,), 2.0), torch.from_numpy(x)).numpy()
+    bound = proof.bound(np.full(50, 2.0), x)
+    assert (bound <= exact).all()
+    assert (bound > exact - 0.15).all()
 
 
 def test_a_smoothed_payoff_leaves_the_proof_as_it_is(tmp_path):

@@ -131,14 +131,30 @@ class Affine:
         function = getattr(torch.Tensor, name, None) if not name.startswith("_") else None
         if function is None:
             raise AttributeError(name)
+        if not callable(function):
+            raise ProofError(_unknown(name))
         return lambda *args, **kwargs: self.__torch_function__(function, (), (self, *args), kwargs)
 
     @classmethod
     def __torch_function__(cls, func: Any, types: Any, args: Sequence[Any] = (), kwargs: Any = None) -> Any:
-        name = getattr(func, "__name__", str(func)).strip("_")
+        name = getattr(func, "__name__", str(func))
+        # Functions such as add_ change their argument in place, which forms cannot.
+        name = name.strip("_") if name.startswith("_") else name
         if name not in FUNCTIONS:
-            raise ProofError(f"torch.{name}: no enclosure of this function is known, so that nothing can be proved")
-        return FUNCTIONS[name](*args, **(kwargs or {}))
+            raise ProofError(_unknown(name))
+        try:
+            return FUNCTIONS[name](*args, **(kwargs or {}))
+        except TypeError as error:
+            raise ProofError(
+                f"torch.{name}: no enclosure is known with these arguments, so that nothing can be proved: {error}"
+            ) from error
+
+    def __bool__(self) -> bool:
+        raise ProofError("if: a branch on states or controls has no enclosure; torch.where has one")
+
+    def __array_ufunc__(self, function: Any, _: str, *args: Any, **kwargs: Any) -> Any:
+        """Numpy's functions, also the products with its numbers, are torch's functions of the same name."""
+        return self.__torch_function__(function, (), args, kwargs)
 
     # Arithmetic
 
@@ -186,9 +202,12 @@ class Affine:
     def __rtruediv__(self, other: Number) -> Affine:
         return self.reciprocal() * other
 
-    def __pow__(self, exponent: int) -> Affine:
-        if not (isinstance(exponent, int) and exponent >= 1):
-            raise ProofError(f"**: expected an integer power >= 1, got {exponent!r}")
+    def __pow__(self, exponent: float) -> Affine:
+        if exponent == 0.5:
+            return self.sqrt()
+        if not (isinstance(exponent, (int, float)) and exponent >= 1 and exponent == int(exponent)):
+            raise ProofError(f"**: expected the power 0.5 or an integer power >= 1, got {exponent!r}")
+        exponent = int(exponent)
         half = self ** (exponent // 2) if exponent > 1 else self
         if exponent == 1:
             return self
@@ -223,7 +242,9 @@ class Affine:
     def where(self, condition: Tensor, other: Affine | Number) -> Affine:
         """These forms where the condition holds, and the others elsewhere."""
         other = Affine.of(other, self)
-        parts = ((self.centre, other.centre), (self.slopes, other.slopes), (self.radius, other.radius))
+        ndim = max(condition.ndim, self.ndim, other.ndim)
+        slopes = _padded(self.slopes, ndim), _padded(other.slopes, ndim)
+        parts = ((self.centre, other.centre), slopes, (self.radius, other.radius))
         return Affine(*(torch.where(condition, a, b) for a, b in parts))
 
     def matmul(self, matrix: Tensor) -> Affine:
@@ -240,7 +261,7 @@ class Affine:
 
     __matmul__ = matmul
 
-    def sum(self, dim: int = -1, keepdim: bool = False) -> Affine:
+    def total(self, dim: int = -1, keepdim: bool = False) -> Affine:
         """The sum over an axis other than the leading one, counted from the end."""
         if dim >= 0:
             dim -= self.ndim
@@ -250,6 +271,29 @@ class Affine:
             self.slopes.sum(dim, keepdim=keepdim),
             self.radius.sum(dim, keepdim=keepdim) + terms,
         )
+
+
+def _operator(name: str) -> Callable[..., Any]:
+    """An operator of Python, which is that of torch's tensors."""
+    function = getattr(torch.Tensor, name)
+    return lambda *args: Affine.__torch_function__(function, (), args)
+
+
+# Among them are those that have no enclosure. Python would give some of them a meaning of its own: without __eq__, for
+# instance, x == 0 is False.
+for _name in (
+    *("abs", "pos", "eq", "ne", "lt", "le", "gt", "ge", "and", "or", "invert", "mod", "rmod", "floordiv", "rfloordiv"),
+    *("rpow", "iter", "setitem", "array", "float", "int", "index"),
+):
+    setattr(Affine, f"__{_name}__", _operator(f"__{_name}__"))
+
+
+def _unknown(name: str) -> str:
+    """What is said about a function of torch that has no enclosure."""
+    return (
+        f"torch.{name}: no enclosure of this function is known, so that nothing can be proved; those of "
+        f"{', '.join(sorted(FUNCTIONS))} are"
+    )
 
 
 def _padded(slopes: Tensor, ndim: int) -> Tensor:

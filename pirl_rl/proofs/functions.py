@@ -132,6 +132,27 @@ def _abs(z: Affine) -> Affine:
     return Affine(tilted.centre + gap, tilted.slopes, tilted.radius + gap * (1 + 1e-12))
 
 
+def _greater(a: Affine | Number, b: Affine | Number) -> Affine:
+    """Whether a > b, or a >= b: 1 where it holds in a whole box, 0 where it holds nowhere, and else all of [0, 1]."""
+    difference = Affine.of(a, b) - b  # type: ignore[arg-type]
+    holds, fails = difference.low > 0, difference.high < 0
+    centre = torch.where(holds, 1.0, torch.where(fails, 0.0, 0.5)).double()
+    radius = torch.where(holds | fails, 0.0, 0.5).double()
+    return Affine(centre, torch.zeros_like(difference.slopes), radius)
+
+
+def _where(condition: Affine | Tensor, a: Affine | Number, b: Affine | Number) -> Affine:
+    """Where the condition holds in a part of a box only, the forms contain both values."""
+    like = next(form for form in (condition, a, b) if isinstance(form, Affine))
+    a, b = Affine.of(a, like), Affine.of(b, like)
+    if not isinstance(condition, Affine):
+        return a.where(condition, b)
+    middle, apart = (a + b) * 0.5, (a - b) * 0.5
+    reach = torch.maximum(apart.high, -apart.low)
+    both = Affine(middle.centre, middle.slopes, (middle.radius + reach) * (1 + 1e-12))
+    return a.where(condition.low > 0.5, b.where(condition.high < 0.5, both))
+
+
 def _maximum(a: Affine | Tensor, b: Affine | Tensor) -> Affine:
     return (a + b + _abs(Affine.of(a, b) - b)) * 0.5  # type: ignore[operator]
 
@@ -176,7 +197,7 @@ def _norm(z: Affine, p: Any = None, dim: Any = -1, keepdim: bool = False, ord: A
     """The Euclidean norm; where it can be 0 in a box, an interval."""
     if not {p, ord} <= {None, 2, "fro"}:
         raise ProofError(f"norm: expected the Euclidean norm of order 2, got order {ord if p is None else p!r}")
-    squares = _square(z).sum(dim if isinstance(dim, int) else dim[0], keepdim=keepdim)
+    squares = _square(z).total(dim if isinstance(dim, int) else dim[0], keepdim)
     low, high = squares.low.clamp(min=0).sqrt(), squares.high.clamp(min=0).sqrt()
     interval = Affine((low + high) / 2, torch.zeros_like(squares.slopes), (high - low) / 2 + 1e-15 * high)
     safe = squares.low > LEAST
@@ -207,8 +228,12 @@ FUNCTIONS.update(
         "mul": lambda a, b: Affine.of(a, b) * b,
         "div": lambda a, b: Affine.of(a, b) / b,
         "truediv": lambda a, b: Affine.of(a, b) / b,
+        "subtract": lambda a, b: Affine.of(a, b) - b,
+        "multiply": lambda a, b: Affine.of(a, b) * b,
+        "divide": lambda a, b: Affine.of(a, b) / b,
         "neg": lambda a: -a,
-        "pow": lambda a, b: a ** (int(b) if b == int(b) else b),
+        "positive": lambda a: a,
+        "pow": lambda a, b: a**b,
         "square": _square,
         "reciprocal": _reciprocal,
         "abs": _abs,
@@ -227,12 +252,25 @@ FUNCTIONS.update(
         "maximum": _maximum,
         "minimum": _minimum,
         "clamp": _clamp,
+        "clip": _clamp,
+        "gt": _greater,
+        "ge": _greater,
+        "lt": lambda a, b: _greater(b, a),
+        "le": lambda a, b: _greater(b, a),
+        "and": _minimum,
+        "logical_and": _minimum,
+        "or": _maximum,
+        "logical_or": _maximum,
+        "invert": lambda a: 1 - a,
+        "logical_not": lambda a: 1 - a,
+        "sign": lambda z: _greater(z, 0.0) * 2 - 1,
+        "where": _where,
         "amax": _extreme(_maximum),
         "amin": _extreme(_minimum),
         "norm": _norm,
         "linalg_norm": _norm,
         "linalg_vector_norm": _norm,
-        "sum": lambda z, dim=-1, keepdim=False: z.sum(dim, keepdim),
+        "sum": lambda z, dim=-1, keepdim=False: z.total(dim, keepdim),
         "matmul": _matmul,
     }
 )

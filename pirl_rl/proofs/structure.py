@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pirl_rl.errors import ProofError
 from pirl_rl.proofs.affine import FUNCTIONS, Affine
 
 
@@ -42,13 +41,6 @@ def _expand(z: Affine, *shape: Any) -> Affine:
     return Affine(z.centre.expand(sizes), z.slopes.expand(len(z.slopes), *sizes), z.radius.expand(sizes))
 
 
-def _where(condition: Tensor, a: Affine | Tensor, b: Affine | Tensor) -> Affine:
-    if isinstance(condition, Affine):
-        raise ProofError("torch.where: expected a condition that does not depend on the state")
-    like = a if isinstance(a, Affine) else b
-    return Affine.of(a, like).where(condition, b)  # type: ignore[arg-type]
-
-
 def _like(make: Callable[..., Tensor]) -> Callable[..., Tensor]:
     return lambda z, **_: make(z.centre)
 
@@ -72,10 +64,13 @@ FUNCTIONS.update(
         "squeeze": lambda z, dim: z.map(lambda entry: entry.squeeze(dim)),
         "expand": _expand,
         "clone": lambda z: z,
-        "where": _where,
+        "detach": lambda z: z,
+        "double": lambda z: z,
         "to": _to,
         "ones_like": _like(torch.ones_like),
         "zeros_like": _like(torch.zeros_like),
         "full_like": _filled,
+        "new_ones": lambda z, *shape, **_: torch.ones(*shape, dtype=torch.float64),
+        "new_full": lambda z, shape, value, **_: torch.full(shape, value, dtype=torch.float64),
     }
 )
