@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
@@ -109,6 +110,34 @@ def test_a_function_of_a_box_is_enclosed(name, size):
         return FUNCTIONS[name](x[:, 0])
 
     assert_encloses(function(Affine.of_box(centre, half)), function, centre, half, rng)
+
+
+PRECISE = {
+    "exp": lambda z: z.exp(),
+    "sigmoid": lambda z: 1 / (1 + (-z).exp()),
+    "silu": lambda z: z / (1 + (-z).exp()),
+    "softplus": lambda z: (1 + z.exp()).ln(),
+    "square": lambda z: z * z,
+    "tanh": lambda z: 1 - 2 / (1 + (2 * z).exp()),
+}
+
+
+@pytest.mark.parametrize("name", PRECISE)
+def test_an_enclosure_has_room_for_its_rounding(name):
+    """With 60 digits, in boxes of many sizes, and where functions are nearly straight."""
+    rng, count = torch.Generator().manual_seed(7), 600
+    centre = 45 * (2 * torch.rand(count, 1, generator=rng, dtype=torch.float64) - 1)
+    centre[::10] = 0.0
+    half = 10 ** (1 - 15 * torch.rand(count, 1, generator=rng, dtype=torch.float64))
+    form = FUNCTIONS[name](Affine.of_box(centre, half)[:, 0])
+    rows = torch.stack([centre[:, 0], half[:, 0], form.centre, form.slopes[0], form.radius, form.low, form.high], -1)
+    with localcontext(prec=60):
+        for row in rows.tolist():
+            c, h, middle, slope, radius, low, high = map(Decimal, row)
+            for e in map(Decimal, (-1, 0, 1)):
+                value = PRECISE[name](c + h * e)
+                assert low <= value <= high, row
+                assert abs(value - middle - slope * e) <= radius, row
 
 
 @pytest.mark.parametrize("name", ["silu", "tanh", "sin", "exp", "product", "sqrt"])

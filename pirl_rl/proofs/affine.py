@@ -229,7 +229,7 @@ class Affine:
             monotone: whether phi never falls, so that its values at both ends enclose it too.
         """
         value, slope_ = function(self.centre), slope(self.centre)
-        spread, low, high = self.spread, self.low, self.high
+        spread, low, high = self.spread + self._slack, self.low, self.high
         radius = slope_.abs() * self.radius + curvature(low, high) * spread.square() / 2
         rounding = 8 * ROUNDING * (value.abs() + slope_.abs() * self.magnitude)
         result = Affine(value, slope_ * self.slopes, radius + rounding)

@@ -17,24 +17,25 @@ LEAST = 1e-12
 """An argument of a root, a logarithm or a reciprocal must be above this in the whole box."""
 
 
+def _bell(z: Tensor) -> Tensor:
+    """The slope of the sigmoid. As y (1 - y) it would have no correct digits where y is rounded to 1."""
+    return torch.sigmoid(z) * torch.sigmoid(-z)
+
+
 def _tanh(z: Affine) -> Affine:
     """|tanh''| = 2 |tanh| (1 - tanh^2) rises up to |z| = 0.6585, where it is 0.7699, and falls beyond."""
     steepest = math.atanh(1 / math.sqrt(3))
 
     def curvature(low: Tensor, high: Tensor) -> Tensor:
         least, most = _distances(low, high)
-        y = torch.tanh(least.clamp(min=steepest).where(most > steepest, most))
-        return 2 * y * (1 - y.square()) * (1 + 1e-12)
+        worst = least.clamp(min=steepest).where(most > steepest, most)
+        return 8 * torch.tanh(worst) * _bell(2 * worst) * (1 + 1e-12)
 
-    return z.smooth(torch.tanh, lambda c: 1 - torch.tanh(c).square(), curvature, True)
+    return z.smooth(torch.tanh, lambda c: 4 * _bell(2 * c), curvature, True)
 
 
 def _sigmoid(z: Affine) -> Affine:
-    def slope(c: Tensor) -> Tensor:
-        y = torch.sigmoid(c)
-        return y * (1 - y)
-
-    return z.smooth(torch.sigmoid, slope, _constant(1 / (6 * math.sqrt(3))), True)
+    return z.smooth(torch.sigmoid, _bell, _constant(1 / (6 * math.sqrt(3))), True)
 
 
 def _silu(z: Affine) -> Affine:
@@ -45,13 +46,11 @@ def _silu(z: Affine) -> Affine:
 
     def curvature(low: Tensor, high: Tensor) -> Tensor:
         least, _ = _distances(low, high)
-        y = torch.sigmoid(least)
-        size = (y * (1 - y) * (2 + least * (1 - 2 * y))).abs()
+        size = (_bell(least) * (2 - least * torch.tanh(least / 2))).abs()
         return torch.where(least < 3.44, size.clamp(min=0.04), size) * (1 + 1e-12)
 
     def slope(c: Tensor) -> Tensor:
-        y = torch.sigmoid(c)
-        return y + c * y * (1 - y)
+        return torch.sigmoid(c) + c * _bell(c)
 
     return z.smooth(torch.nn.functional.silu, slope, curvature)
 
