@@ -148,6 +148,26 @@ class InPlace(Branching):
         return level
 
 
+class Kept(PlanarQuadrotor):
+    """Conditions on several entries at once, which keep their axis, and depend on the axis that they keep."""
+
+    def unreachable(self, x):
+        few = (x <= 0.4).all(-1, keepdim=True) & (x < 0.2).any(-1, keepdim=True)
+        return (few & (x[..., :2] > -0.5)).all(-1)
+
+
+def test_conditions_that_keep_their_axis_do_in_a_model(tmp_path):
+    solution = solution_of(Kept())
+    tau, x = points(solution.problem, 2_000)
+    x[:1_000] = 0.5 * torch.rand(1_000, x.shape[1], generator=torch.Generator().manual_seed(2))
+    assert 100 < Kept().unreachable(x).sum() < 1_900
+    assert_answers(record(solution).module()(tau, x), solution, tau, x, TOLERANCE)
+    session = pytest.importorskip("onnxruntime").InferenceSession(write_model(solution, "onnx", tmp_path))
+    names = [output.name for output in session.get_outputs()]
+    answer = dict(zip(names, session.run(None, {"tau": tau.numpy(), "x": x.numpy()}), strict=True))
+    assert_answers(answer, solution, tau, x, TOLERANCE)
+
+
 @pytest.mark.parametrize("problem", [VehicleDrift(), InPlace()], ids=["equal parts", "in place"])
 def test_a_graph_has_the_numbers_of_the_solution_and_each_part_once(problem):
     """Networks and masks look the same levels up, and nothing is multiplied by ones."""

@@ -63,5 +63,5 @@ def _compare_once(graph: Graph) -> None:
         if isinstance(compared, Node) and compared.target is aten.le.Scalar:
             entries, number = compared.args
             with graph.inserting_before(node):
-                largest = graph.call_function(aten.amax.default, (entries, [node.args[1]]))
+                largest = graph.call_function(aten.amax.default, (entries, [node.args[1]], *node.args[2:]))
                 node.replace_all_uses_with(graph.call_function(aten.le.Scalar, (largest, number)))
