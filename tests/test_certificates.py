@@ -213,10 +213,12 @@ def test_the_certificate_names_the_networks_and_is_plain_json():
         ({"confidence": 1.0}, "confidence: expected a number between 0 and 1"),
         ({"picked_from": 0}, "picked_from: expected an integer >= 1"),
         ({"starts": OneStart(2.0, (0.0,)), "certifiers": {"band": ValueBand()}}, "starts: expected a law"),
-        ({"certifiers": {"band": ValueBand(10)}}, "states: expected more of them"),
+        ({"certifiers": {"success": SuccessBound(10), "band": ValueBand(10)}}, "states: expected more of them"),
+        ({"certifiers": {"threshold": SafeThreshold(1)}}, "states: expected an integer >= 2, got 1"),
     ],
 )
-def test_wrong_arguments_are_refused(change, message):
+def test_wrong_arguments_are_refused_before_a_path_is_played(change, message, monkeypatch):
+    monkeypatch.setattr(Deployed, "successes", None)
     solution, simulator = reach1d()
     arguments = {"starts": LAW, "certifiers": {"success": SuccessBound(10)}} | change
     with pytest.raises(ArgumentError, match=message):

@@ -23,13 +23,18 @@ class ValueBand(States):
     G. Shafer, Algorithmic Learning in a Random World, 2005; S. S. Wilks, 1941).
     """
 
-    def __call__(self, deployed: Deployed, starts: Starts, level: Level, rngs: Rngs) -> Claim:
-        order = order_of_quantile(self.states, self.shown, level.each)
-        if order is None:
+    def check(self, starts: Starts, level: Level) -> None:
+        """Refuse a single start, and fewer states than the order statistic needs."""
+        super().check(starts, level)
+        if order_of_quantile(self.states, self.shown, level.each) is None:
             raise ArgumentError(
                 f"states: expected more of them for a claim about all but {self.share:g} with confidence "
                 f"{level.confidence:g}, got {self.states}"
             )
+
+    def __call__(self, deployed: Deployed, starts: Starts, level: Level, rngs: Rngs) -> Claim:
+        order = order_of_quantile(self.states, self.shown, level.each)
+        assert order is not None  # as checked
         found = self.play(deployed, starts, rngs)
         scores = np.maximum(found.value - found.lower, found.upper - found.value)
         eps = float(np.sort(scores)[order - 1])

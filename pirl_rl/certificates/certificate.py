@@ -119,9 +119,12 @@ def certify(
     check_integer("seed", seed, 0)
     if not isinstance(corollary, bool):
         raise ArgumentError(f"corollary: expected true or false, got {corollary!r}")
-    # Before the paths, which take longer: it may refuse its arguments.
+    level = Level(confidence, picked_from)
+    # Before the paths, which take longer, all that may refuse its arguments.
+    for certifier in certifiers.values():
+        certifier.check(starts, level)
     diagnostics = {"corollary": diagnose(solution, simulator, confidence, SEEDS + seed)} if corollary else {}
-    deployed, level = Deployed(solution, simulator), Level(confidence, picked_from)
+    deployed = Deployed(solution, simulator)
     claims = {
         name: certifier(deployed, starts, level, Rngs.of(solution, len(certifiers) * seed + i))
         for i, (name, certifier) in enumerate(certifiers.items())

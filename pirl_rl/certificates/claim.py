@@ -69,6 +69,14 @@ class Level(NamedTuple):
 class Certifier(Protocol):
     """Measures and makes one claim."""
 
+    def check(self, starts: Starts, level: Level) -> None:
+        """Refuse before any path is played what can make no claim.
+
+        Raises:
+            ArgumentError: with the name of the argument.
+        """
+        ...
+
     def __call__(self, deployed: Deployed, starts: Starts, level: Level, rngs: Rngs) -> Claim:
         """The claim about a policy and its V."""
         ...

@@ -9,6 +9,7 @@ import numpy as np
 
 from pirl_rl.arguments import check_integer
 from pirl_rl.certificates.bounds import check_level, lower_bound, upper_bound
+from pirl_rl.certificates.claim import Level
 from pirl_rl.certificates.deployed import Deployed, OneStart, Rngs, Starts
 from pirl_rl.errors import ArgumentError
 
@@ -56,14 +57,13 @@ class States:
         """The share of states that show a fault, at least, if more than `share` have it."""
         return self.share * (1 - MISSED)
 
-    def play(self, deployed: Deployed, starts: Starts, rngs: Rngs) -> Bounded:
-        """The bounds at states that are drawn and played.
-
-        Raises:
-            ArgumentError: there is a single start, of which no share can be missed.
-        """
+    def check(self, starts: Starts, level: Level) -> None:
+        """Refuse a single start, of which no share can be missed."""
         if isinstance(starts, OneStart):
             raise ArgumentError(f"starts: expected a law for a claim about almost all states, got {starts.describe()}")
+
+    def play(self, deployed: Deployed, starts: Starts, rngs: Rngs) -> Bounded:
+        """The bounds at states that are drawn and played."""
         tau, x = starts.draw(deployed, self.states, rngs.starts)
         count = deployed.successes(tau, x, self.rollouts, rngs.noise)
         lower, upper = (bound(count, self.rollouts, 1 - MISSED) for bound in (lower_bound, upper_bound))

@@ -44,6 +44,9 @@ class SuccessBound:
         if self.at_least is not None:
             check_level("at_least", self.at_least)
 
+    def check(self, starts: Starts, level: Level) -> None:
+        """Nothing is refused: any starts and any level will do."""
+
     def __call__(self, deployed: Deployed, starts: Starts, level: Level, rngs: Rngs) -> Claim:
         tau, x = starts.draw(deployed, self.episodes, rngs.starts)
         played, successes, lower = self._play(deployed, tau, x, level.each, rngs)

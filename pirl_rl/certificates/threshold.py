@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pirl_rl.arguments import check_integer
 from pirl_rl.certificates.bounds import check_level, upper_bound
 from pirl_rl.certificates.claim import Claim, Level
 from pirl_rl.certificates.deployed import Deployed, Rngs, Starts
@@ -37,6 +38,11 @@ class SafeThreshold(States):
     def __post_init__(self):
         super().__post_init__()
         check_level("success", self.success)
+
+    def check(self, starts: Starts, level: Level) -> None:
+        """Refuse a single start, and a single state, which has no half."""
+        super().check(starts, level)
+        check_integer("states", self.states, 2)
 
     def __call__(self, deployed: Deployed, starts: Starts, level: Level, rngs: Rngs) -> Claim:
         found = self.play(deployed, starts, rngs)
