@@ -115,6 +115,22 @@ def test_a_filter_corrects_the_actions_and_says_so(exit_filter):
     assert infos["action"][:, 0] == pytest.approx(np.where(expected, 1.0, -1.0), abs=1e-6)
 
 
+def test_wrappers_of_actions_go_around_a_filter(exit_filter):
+    """Outside, the action 0 of [0, 1] is the control -1; inside, the filter would read it as the control 0."""
+    plain = gymnasium.make("pirl_rl/Exit1D-v0", dt=0.1, substeps=1)
+    outside = gymnasium.wrappers.RescaleAction(FilteredGym(plain, exit_filter), np.float32(0.0), np.float32(1.0))
+    outside.reset(seed=1)
+    refused = bool(exit_filter.correct(*plain.unwrapped.paths.time_and_state, -torch.ones(1, 1))[1])
+    info = outside.step(np.zeros(1, np.float32))[-1]
+    assert info["action"] == pytest.approx([1.0 if refused else -1.0], abs=1e-6)
+    with pytest.raises(ArgumentError, match="no wrapper inside the filter that changes actions, got RescaleAction"):
+        FilteredGym(gymnasium.wrappers.RescaleAction(plain, np.float32(0.0), np.float32(1.0)), exit_filter)
+    many = gymnasium.make_vec("pirl_rl/Exit1D-v0", 5, dt=0.1, substeps=1)
+    with pytest.raises(ArgumentError, match="no wrapper inside the filter that changes actions, got ClipAction"):
+        FilteredVectorGym(gymnasium.wrappers.vector.ClipAction(many), exit_filter)
+    FilteredVectorGym(gymnasium.wrappers.vector.RecordEpisodeStatistics(many), exit_filter)
+
+
 def test_a_filter_belongs_to_the_problem_of_its_environment(exit_filter):
     with pytest.raises(ArgumentError, match="reach_avoid_filter: expected one of the problem Reach1D, got Exit1D"):
         FilteredGym(ReachAvoidGym(Reach1D(), dt=0.1), exit_filter)

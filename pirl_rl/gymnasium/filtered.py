@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv, VectorWrapper
+from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
 from pirl_rl.errors import ArgumentError
@@ -22,17 +22,20 @@ class FilteredGym(gymnasium.Wrapper):
     it took, normalised to [-1, 1].
 
     Args:
-        env: an environment of this package, possibly inside other wrappers.
+        env: an environment of this package, possibly inside other wrappers, but none that changes actions: such a
+            wrapper goes around this one, as in `RescaleAction(FilteredGym(env, reach_avoid_filter), 0.0, 1.0)`.
         reach_avoid_filter: the filter; its own nominal controller has no part, since the action is the nominal control.
 
     Raises:
-        ArgumentError: the environment is not one of this package, or the filter is that of another problem.
+        ArgumentError: the environment is not one of this package, a wrapper inside changes actions, or the filter is
+            that of another problem.
     """
 
     def __init__(self, env: gymnasium.Env, reach_avoid_filter: ReachAvoidFilter):
         super().__init__(env)
         if not isinstance(env.unwrapped, ReachAvoidGym):
             raise ArgumentError(f"env: expected a ReachAvoidGym, got a {type(env.unwrapped).__name__}")
+        _expect_no_change_of_actions(env)
         self._paths, self._filter = env.unwrapped.paths, reach_avoid_filter
         _expect_same_problem(self._paths, reach_avoid_filter)
 
@@ -47,7 +50,7 @@ class FilteredVectorGym(VectorWrapper):
     """Many paths whose actions a filter corrects; the information of a step has `intervened` (N,) and `action` (N, m).
 
     Args:
-        env: a vector environment of this package, possibly inside other wrappers.
+        env: a vector environment of this package, possibly inside other wrappers, see `FilteredGym`.
         reach_avoid_filter: see `FilteredGym`.
 
     Raises:
@@ -58,6 +61,7 @@ class FilteredVectorGym(VectorWrapper):
         super().__init__(env)
         if not isinstance(env.unwrapped, ReachAvoidVectorGym):
             raise ArgumentError(f"env: expected a ReachAvoidVectorGym, got a {type(env.unwrapped).__name__}")
+        _expect_no_change_of_actions(env)
         self._paths, self._filter = env.unwrapped, reach_avoid_filter
         _expect_same_problem(self._paths, reach_avoid_filter)
 
@@ -80,6 +84,19 @@ def _corrected(
     u, intervened = reach_avoid_filter.correct(tau, x, controls.denormalize(action))
     played = torch.where(intervened.unsqueeze(-1), controls.normalize(u), action).clamp(-1, 1)
     return played.numpy().astype(np.float32), intervened.numpy()
+
+
+def _expect_no_change_of_actions(env: gymnasium.Env | VectorEnv) -> None:
+    """Refuse wrappers of actions: the filter gives the normalised control, which they would change once more."""
+    while isinstance(env, (gymnasium.Wrapper, VectorWrapper)):
+        changes = isinstance(env, (gymnasium.ActionWrapper, VectorActionWrapper))
+        if changes or env.action_space != env.env.action_space:
+            name = type(env).__name__
+            raise ArgumentError(
+                f"env: expected no wrapper inside the filter that changes actions, got {name}; put it around the "
+                f"filtered environment, as in {name}(FilteredGym(env, reach_avoid_filter), ...)"
+            )
+        env = env.env
 
 
 def _expect_same_problem(paths: ReachAvoidVectorGym, reach_avoid_filter: ReachAvoidFilter) -> None:
