@@ -177,6 +177,18 @@ def test_each_rule(changes, level, reason):
     assert not reasons or reason in reasons[0].why
 
 
+@pytest.mark.parametrize(
+    ("invariance", "advice"),
+    [(False, "that the horizon suffices"), (True, "can stay out of the avoid set for the whole horizon")],
+)
+@pytest.mark.parametrize("success", [0.0, 2e-3])
+def test_the_advice_where_hardly_a_path_succeeds_fits_the_objective(invariance, advice, success):
+    measures = dataclasses.replace(GOOD, success=success, high=3e-3, random=0.0, constant=0.0, invariance=invariance)
+    last = describe(measures, judge(measures))[-1]
+    assert last.startswith("next      check the sets with python -m pirl_rl.check, and that ")
+    assert last.endswith(advice)
+
+
 def test_controls_that_never_move_are_named_and_eight_lines_suffice():
     measures = dataclasses.replace(
         GOOD, still=[0, 2], gap=0.2, over_constant=Difference(0.3, 0.01), value_spread=0.0, gain_at=[0.0] * 9

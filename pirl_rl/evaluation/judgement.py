@@ -22,9 +22,6 @@ BIAS = 0.02
 BETTER = 0.02
 """The mean success by which another policy, or another time step, must differ to matter."""
 
-LOOK_AT_SETS = "check the sets with python -m pirl_rl.check, and that the horizon suffices"
-"""The advice where no path succeeds, or hardly any."""
-
 ERRORS = 3.0
 """The number of standard errors by which a difference must exceed 0 to matter."""
 
@@ -128,7 +125,7 @@ def _failures(m: Measures):
         if others > 0:
             also = f"while another control does in {others:.2g} of the paths"
         how = "never" if m.success == 0 else "hardly ever"
-        yield Reason("failed", f"The policy {how} {_event(m)}, {also}.", LOOK_AT_SETS)
+        yield Reason("failed", f"The policy {how} {_event(m)}, {also}.", _look_at_sets(m))
     if m.over_constant.mean > 0 and m.over_constant.matters():
         control = _numbers(m.constant_control)
         yield Reason(
@@ -153,7 +150,7 @@ def _failures(m: Measures):
 def _doubts(m: Measures):
     if m.success > 0 and max(m.high, m.random, m.constant) < RARE:
         why = f"The policy {_event(m)} in {m.success:.2g} of the paths, and random and constant controls hardly ever."
-        yield Reason("doubtful", why, LOOK_AT_SETS)
+        yield Reason("doubtful", why, _look_at_sets(m))
     if not m.is_wrong(LARGE_GAP) and (m.is_wrong(GAP) or m.bias.matters(BIAS)):
         sign = "above" if m.bias.mean > 0 else "below"
         yield Reason(
@@ -177,6 +174,14 @@ def _doubts(m: Measures):
 
 def _event(m: Measures) -> str:
     return "stays out of the avoid set" if m.invariance else "reaches the target"
+
+
+def _look_at_sets(m: Measures) -> str:
+    """The advice where no path succeeds, or hardly any."""
+    wanted = (
+        "some control can stay out of the avoid set for the whole horizon" if m.invariance else "the horizon suffices"
+    )
+    return f"check the sets with python -m pirl_rl.check, and that {wanted}"
 
 
 def describe(m: Measures, reasons: list[Reason]) -> list[str]:
