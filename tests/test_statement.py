@@ -101,6 +101,16 @@ def test_names_must_be_as_many_as_the_coordinates(names):
         check_problem(problem)
 
 
+class Large(ZermeloBoat):
+    """Levels in units of 2^-40 m, so that a thousandth of a meter is a large number."""
+
+    def target_level(self, x):
+        return 2.0**40 * super().target_level(x)
+
+    def avoid_constraints(self, x):
+        return 2.0**40 * super().avoid_constraints(x)
+
+
 def test_pictures_show_the_sets_in_their_places():
     """The landing is the disc around (1.4, 0.4) with radius 0.3 m; the picture is 1.25 times as wide as the box."""
     [picture] = outlines(ZermeloBoat(), ZermeloBoat().planes)
@@ -109,6 +119,8 @@ def test_pictures_show_the_sets_in_their_places():
     y = -1.25 + 2.5 * (1 - corners[:, 1] / picture["height"])
     assert np.abs(np.hypot(x - 1.4, y - 0.4) - 0.3).max() < 0.005
     assert picture["width"] / picture["height"] == 2  # both axes have the same scale
+    [other] = outlines(Large(), ZermeloBoat().planes)
+    assert other["paths"] == picture["paths"]
     [line] = outlines(Reach1D(), {})
     ends = sorted({float(x) for x, _ in re.findall(r"(-?[\d.]+) (-?[\d.]+)", line["paths"]["target"])})
     assert -2.5 + 5.0 * ends[0] / line["width"] == pytest.approx(2.0, abs=0.01)

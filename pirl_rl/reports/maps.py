@@ -18,7 +18,7 @@ from pirl_rl.evaluation.inputs import like
 from pirl_rl.evaluation.planes import slopes_of
 from pirl_rl.evaluation.slices import Section
 from pirl_rl.reports.names import as_html, control_names, split_unit, state_names
-from pirl_rl.reports.outlines import FAR, equal_scales, levels_of
+from pirl_rl.reports.outlines import equal_scales, levels_of
 from pirl_rl.reports.packing import packed, quantised
 from pirl_rl.sets import Plane
 from pirl_rl.solution import Solution
@@ -152,8 +152,7 @@ def _layers(solution: Solution, taus: list[float], grids: list[Tensor]) -> dict[
 
 def _signed(level: Tensor) -> np.ndarray:
     """Levels (N,) as integers, at most 127 inside the set and at least 128 outside."""
-    near = level.abs()[level.abs() < FAR]
-    scale = LEVELS * float(near.max()) if len(near) and float(near.max()) > 0 else 1.0
+    scale = LEVELS * float(level.abs().max()) or 1.0
     codes = quantised((level / scale).numpy(), -1.0, 1.0, 255)
     return np.where((level <= 0).numpy(), np.minimum(codes, 127), np.maximum(codes, 128)).astype(np.uint8)
 

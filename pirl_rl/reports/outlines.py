@@ -27,9 +27,6 @@ MARGIN = 1.25
 WIDTH, HEIGHT, STRIP = 300.0, 240.0, 36.0
 """The size of a picture in pixels, and the height of that of a problem with one state."""
 
-FAR = 1e6
-"""The largest level, which stands for an infinite one."""
-
 
 def outlines(problem: ReachAvoidProblem, planes: Mapping[str, Plane]) -> list[dict[str, Any]]:
     """A picture of both sets on each plane, or on the line where the problem has one state."""
@@ -53,13 +50,22 @@ def _height(plane: Plane) -> float:
 
 
 def levels_of(problem: ReachAvoidProblem, x: Tensor) -> dict[str, Tensor]:
-    """The levels (N,) of the sets that a problem has, "target" and "avoid", at states (N, n), finite."""
+    """The levels (N,) of the sets that a problem has, "target" and "avoid", at states (N, n).
+
+    One that is infinite, or not a number, becomes as large as the largest of the others.
+    """
     levels = {}
     if problem.objective == "reach-avoid":
         levels["target"] = problem.reached_constraints(x).amax(-1)
     if problem.has_avoid_set:
         levels["avoid"] = problem.avoid_level(x)
-    return {name: level.double().nan_to_num(FAR, FAR, -FAR).clamp(-FAR, FAR) for name, level in levels.items()}
+    return {name: _finite(level.double()) for name, level in levels.items()}
+
+
+def _finite(level: Tensor) -> Tensor:
+    numbers = level[level.isfinite()]
+    far = float(numbers.abs().max()) if len(numbers) else 1.0
+    return level.nan_to_num(far, far, -far)
 
 
 def equal_scales(plane: Plane) -> bool:
