@@ -529,7 +529,7 @@ def test_three_states_are_proved_on_a_coarse_mesh():
 
 @pytest.mark.slow
 def test_three_states_are_proved_on_the_default_mesh():
-    """Nowhere above the intervals of Monte Carlo with a control step of 0.01 s, but for their confidence of 95 %."""
+    """Nowhere above the intervals of Monte Carlo with a control step of 0.01 s, except by their confidence of 95 %."""
     problem, actor = Cube(), Towards()
     solution = Stand(problem, actor)
     proof = prove_success(solution, "none")
