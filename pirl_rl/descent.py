@@ -41,7 +41,8 @@ def descended(constraints: Callable[[Tensor], Tensor], x: Tensor, box: Box, step
     slope, optimizer = torch.func.grad(lambda z: level(z).sum()), torch.optim.Adam([z], lr=FIRST * STEPS / steps)
     decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST / FIRST) ** (1 / steps))
     for _ in range(steps):
-        z.grad = slope(z.detach())
+        # Where the level has no slope, as where it is infinite, the last steps lead on.
+        z.grad = slope(z.detach()).nan_to_num(0.0, 0.0, 0.0)
         optimizer.step()
         decay.step()
         with torch.no_grad():

@@ -19,6 +19,9 @@ ROOT_TIME_OFFSET = 1e-4
 LEVEL_POINTS = 4_096
 """The number of states at which the levels of the sets are taken to scale them."""
 
+FAR = (2.0, 16.0, 128.0, 1_024.0, 8_192.0)
+"""Widths of boxes in which levels are asked for their numbers, in widths of `states`; paths may come so far."""
+
 LOG_WIDTH = 0.01
 """The width of `LogLevels`, as a share of the standard deviation of a level over the box of states."""
 
@@ -83,11 +86,23 @@ def perceptron(
     return nn.Sequential(*layers, Dense(width, outputs), *([] if last is None else [last]))
 
 
-def _constraints(problem: ReachAvoidProblem, kept: Sequence[int] | None, x: Tensor) -> Tensor:
-    """The levels (*, k) of the constraints of A and B at states (*, n); of all, or of those with the numbers `kept`."""
+Ends = Sequence[tuple[float, float]]
+"""The least and the largest number of each of k levels in the box of states."""
+
+
+def _constraints(problem: ReachAvoidProblem, kept: Sequence[int] | None, x: Tensor, ends: Ends | None = None) -> Tensor:
+    """The levels (*, k) of the constraints of A and B at states (*, n); of all, or of those with the numbers `kept`.
+
+    With `ends`, a level that is infinite or has no number takes one of them: deep in its set it is the least, and else,
+    as far outside, the largest.
+    """
     sets = [problem.reached_constraints(x)] if problem.objective == "reach-avoid" else []
     both = torch.cat(sets + ([problem.avoid_constraints(x)] if problem.has_avoid_set else []), -1)
-    return both if kept is None else both[..., kept]
+    levels = both if kept is None else both[..., kept]
+    if ends is None:
+        return levels
+    pairs = zip(levels.unbind(-1), ends, strict=True)
+    return torch.stack([torch.where(one.isfinite(), one, torch.where(one < 0, *pair)) for one, pair in pairs], -1)
 
 
 def _levels(problem: ReachAvoidProblem) -> tuple[Levels, Tensor, Tensor]:
@@ -99,7 +114,11 @@ def _levels(problem: ReachAvoidProblem) -> tuple[Levels, Tensor, Tensor]:
     # A level that is constant or infinite says nothing.
     kept = ((width > 0) & width.isfinite()).nonzero().flatten().tolist()
     levels = partial(_constraints, problem, kept if len(kept) < len(width) else None)
-    return Levels(levels, problem.states.dim), sampled[:, kept], problem.interior(x)
+    inside, rng = sampled[:, kept], torch.Generator().manual_seed(0)
+    far = torch.cat([problem.states.expand(factor).sample(LEVEL_POINTS, rng, x.dtype) for factor in FAR])
+    if not levels(far).isfinite().all():
+        levels = partial(levels, ends=[*zip(inside.amin(0).tolist(), inside.amax(0).tolist(), strict=True)])
+    return Levels(levels, problem.states.dim), inside, problem.interior(x)
 
 
 def _range_of_logs(logs: LogLevels, sampled: Tensor) -> tuple[Tensor, Tensor]:
