@@ -53,7 +53,9 @@ def crossing_probability(
         h: the time between the ends (N,), in s.
         decisive: the face whose curvature counts.
     """
-    return _chance(*_bridge(constraints, x, moved, sigma, h, decisive))
+    level, after, variance = _bridge(constraints, x, moved, sigma, h, decisive)
+    # An infinite level is out of reach, and an infinite slope gives no tangent.
+    return _chance(level, after, torch.where((level < torch.inf) & variance.isfinite(), variance, 0.0))
 
 
 def crosses_any(

@@ -91,7 +91,13 @@ def entrance_probability(
 def _brownian_levels(
     constraints: Constraints, x: Tensor, moved: Tensor, sigma: Tensor, h: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The levels (N, k) at x, and in units of h their drift towards 0 and their deviation, each (N, k)."""
+    """The levels (N, k) at x, and in units of h their drift towards 0 and their deviation, each (N, k).
+
+    Where the level at x is infinite or has no number the face is out of reach. The level is 1 there, or -1 deep inside,
+    and stands still.
+    """
     level, after = constraints(x), constraints(moved)
-    variance = squared_noise(constraints, x, sigma, level.shape[-1]) * h[..., None]
-    return level, level - after, variance.sqrt().clamp(min=torch.finfo(x.dtype).tiny ** 0.5)
+    variance = (squared_noise(constraints, x, sigma, level.shape[-1]) * h[..., None]).nan_to_num(0.0, 0.0)
+    way, near = (level - after).nan_to_num(-torch.inf, torch.inf, -torch.inf), level.isfinite()
+    way, variance = (torch.where(near, entry, 0.0) for entry in (way, variance))
+    return level.nan_to_num(1.0, 1.0, -1.0), way, variance.sqrt().clamp(min=torch.finfo(x.dtype).tiny ** 0.5)

@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from pirl_rl.crossings import crossing_probability
 from pirl_rl.passages import entrance_probability, first_passage, passage_probability
 
 
@@ -90,3 +91,35 @@ def test_the_entrance_through_one_face_is_a_first_passage():
     path = x, x - 0.5, sigma, h
     expected = passage_probability(lambda y: y, *path)[:, 0]
     torch.testing.assert_close(entrance_probability(lambda y: y, None, *path), expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_face_whose_level_is_infinite_or_no_number_is_out_of_reach(dtype):
+    """Paths start where such levels are infinite or no numbers, step there, or are where their slope is infinite."""
+    x = torch.tensor([[-1.0, 0.5], [0.0, 0.5], [0.5, 0.5]], dtype=dtype)
+    moved = torch.tensor([[0.5, 0.4], [0.5, 0.4], [-0.5, 0.4]], dtype=dtype)
+    sigma, h = torch.full((3, 2, 1), 0.3, dtype=dtype), torch.ones(3, dtype=dtype)
+    undefined = (lambda a: torch.where(a > 0, 1 / a, torch.inf), lambda a: 1 / a.clamp(min=0), lambda a: 9 + a.sqrt())
+
+    def wall(y: Tensor) -> Tensor:
+        return y[:, 1:]
+
+    def both(y: Tensor) -> Tensor:
+        return torch.stack([y[:, 1], *(level(y[:, 0]) for level in undefined)], -1)
+
+    for crossed in (
+        passage_probability(both, x, moved, sigma, h),
+        crossing_probability(both, x, moved, sigma, h, "nearest"),
+    ):
+        assert (crossed[:, 1:] < 1e-3).all()
+    alone = passage_probability(wall, x, moved, sigma, h)
+    assert torch.equal(passage_probability(both, x, moved, sigma, h)[:, :1], alone)
+    assert not entrance_probability(wall, both, x, moved, sigma, h).isnan().any()
+    assert (entrance_probability(both, None, x, moved, sigma, h) < 1e-3).all()
+
+    def inside(y: Tensor) -> Tensor:
+        return torch.stack([y[:, 1], torch.full_like(y[:, 0], -torch.inf)], -1)
+
+    torch.testing.assert_close(
+        entrance_probability(inside, None, x, moved, sigma, h), entrance_probability(wall, None, x, moved, sigma, h)
+    )
