@@ -96,9 +96,10 @@ def continued_value(solution: Solution, tau: Tensor, x: Tensor) -> Tensor:
     y = x = problem.states.wrap(x)
     failed, reached = problem.failed(x), problem.reached(x)
     if problem.has_avoid_set:
-        y = torch.where(failed.unsqueeze(-1), _mirrored(problem.avoid_level, x), y)
+        y = torch.where(failed.unsqueeze(-1), _mirrored(problem.scaled_avoid_level, x), y)
     if problem.objective == "reach-avoid":
-        y = torch.where(reached.unsqueeze(-1), _mirrored(lambda z: problem.reached_constraints(z).amax(-1), x), y)
+        mirrored = _mirrored(lambda z: problem.scaled_reached_constraints(z).amax(-1), x)
+        y = torch.where(reached.unsqueeze(-1), mirrored, y)
     # Networks take one axis of points: stacked critics have an axis of their own before it.
     value = solution.value(tau.flatten(), y.flatten(0, -2)).reshape(tau.shape)
     return torch.where(reached, 2 - value, torch.where(failed, -value, value))

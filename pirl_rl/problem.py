@@ -11,8 +11,9 @@ the physics is written down; networks, environments and integration are elsewher
 from __future__ import annotations
 
 import copy
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import ClassVar, Literal
 
@@ -25,6 +26,9 @@ from pirl_rl.sets import Box, Plane
 
 RANDOM_STATES, WIDER = 100_000, 1.5
 """The number of random states at which A and B are compared, and by which factor their box is wider than `states`."""
+
+UNIT_STATES, USUAL = 256, (2.0**-20, 2.0**20)
+"""The number of random states whose levels show the unit of a level, and the range of sizes that need no other unit."""
 
 
 class ReachAvoidProblem(ABC):
@@ -181,6 +185,29 @@ class ReachAvoidProblem(ABC):
             return self.free_target_constraints(x)
         return _normalized(self.free_target_constraints, x) + self.payoff.epsilon
 
+    def scaled_reached_constraints(self, x: Tensor) -> Tensor:
+        """`reached_constraints` (*, k), each divided by a power of two, so that single precision has its square.
+
+        The power is 1 where levels have a usual size.
+        """
+        return _divided(self.reached_constraints(x), self._reached_units)
+
+    def scaled_avoid_constraints(self, x: Tensor) -> Tensor:
+        """`avoid_constraints` (*, k), each divided by a power of two, see `scaled_reached_constraints`."""
+        return _divided(self.avoid_constraints(x), self._avoid_units)
+
+    def scaled_avoid_level(self, x: Tensor) -> Tensor:
+        """`avoid_level` (*) in the same units."""
+        return self.scaled_avoid_constraints(x).amin(-1) if self._avoid_units else self.avoid_level(x)
+
+    @cached_property
+    def _reached_units(self) -> list[float]:
+        return _units(self.reached_constraints, self.states)
+
+    @cached_property
+    def _avoid_units(self) -> list[float]:
+        return _units(self.avoid_constraints, self.states)
+
     def reached(self, x: Tensor) -> Tensor:
         """Whether states (*, n) are absorbed with success, (*) bool; never in an invariance problem."""
         if self.objective == "invariance":
@@ -217,7 +244,25 @@ def with_indicator(problem: ReachAvoidProblem) -> ReachAvoidProblem:
     """A copy of the problem whose payoff is the indicator, so that to come to A itself is a success."""
     hard = copy.copy(problem)
     hard.payoff = Indicator()
+    hard.__dict__.pop("_reached_units", None)  # they belong to the set of the payoff
     return hard
+
+
+def _units(levels: Callable[[Tensor], Tensor], states: Box) -> list[float]:
+    """Powers of two by which levels (*, k) are divided, or none where all have a usual size."""
+    size = levels(states.sample(UNIT_STATES, torch.Generator().manual_seed(0), torch.float64)).abs()
+    typical = torch.where(size.isfinite(), size, torch.nan).nanmedian(0).values.tolist()
+    unusual = [0 < one < USUAL[0] or one > USUAL[1] for one in typical]
+    if not any(unusual):
+        return []
+    return [2.0 ** math.frexp(one)[1] if needs else 1.0 for one, needs in zip(typical, unusual, strict=True)]
+
+
+def _divided(levels: Tensor, units: Sequence[float]) -> Tensor:
+    """The levels (*, k) in their units, if there are any."""
+    if not units:
+        return levels
+    return torch.stack([one / unit for one, unit in zip(levels.unbind(-1), units, strict=True)], -1)
 
 
 def _normalized(levels, x: Tensor) -> Tensor:

@@ -69,11 +69,11 @@ def across_sets(problem: ReachAvoidProblem, x: Tensor, u: Tensor) -> list[Move]:
     """
     moves = []
     if problem.objective == "reach-avoid":
-        moves += _across(problem, "the target", problem.reached_constraints, x, u)
+        moves += _across(problem, "the target", problem.scaled_reached_constraints, x, u)
     if problem.has_avoid_set:
         # B is a union: each of its constraints is a set of its own.
         for index in range(problem.avoid_constraints(x[:1]).shape[-1]):
-            moves += _across(problem, "the avoid set", _part(problem.avoid_constraints, index), x, u)
+            moves += _across(problem, "the avoid set", _part(problem.scaled_avoid_constraints, index), x, u)
     return moves
 
 

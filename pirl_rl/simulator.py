@@ -260,9 +260,10 @@ class Simulator:
         """The numbers of constraints of A and of B whose crossings are drawn."""
         problem = self.problem
         x = problem.states.sample(2, torch.Generator().manual_seed(0))
-        # Also without a bridge: the problem looks for an overlap of its sets, which must not happen in compiled code.
-        target = problem.reached_constraints(x).shape[-1] if problem.objective == "reach-avoid" else 0
-        avoid = problem.avoid_constraints(x).shape[-1] if problem.has_avoid_set else 0
+        # Also without a bridge: the problem looks for an overlap of its sets and for units of their levels. In compiled
+        # code it must not.
+        target = problem.scaled_reached_constraints(x).shape[-1] if problem.objective == "reach-avoid" else 0
+        avoid = problem.scaled_avoid_constraints(x).shape[-1] if problem.has_avoid_set else 0
         return (target, avoid) if self.crossing == "bridge" else (0, 0)
 
     def _advance(
@@ -285,7 +286,7 @@ class Simulator:
         reached, failed = problem.reached(moved), problem.failed(moved) | lost
         path, within = (x, moved, sigma, h), problem.states.within_period
         if target is not None:
-            reached = reached | enters_intersection(within(problem.reached_constraints), *path, target, corners)
+            reached = reached | enters_intersection(within(problem.scaled_reached_constraints), *path, target, corners)
         if avoid is not None:
-            failed = failed | crosses_any(within(problem.avoid_constraints), *path, avoid)
+            failed = failed | crosses_any(within(problem.scaled_avoid_constraints), *path, avoid)
         return moved, kick, reached, failed

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 import pirl_rl
 from pirl_rl import Box, ReachAvoidProblem
 from pirl_rl.problems import DoubleIntegrator
+from pirl_rl.sampling.boundary import face_weights
+from pirl_rl.sampling.faces import find_faces
+from pirl_rl.simulator import Simulator
 
 LENGTHS, TIME, FORCE, LEVELS = torch.tensor([1e3, 1e-3], dtype=torch.float64), 1e-2, 1e4, (100.0, 1e-3)
 SETTINGS = {
@@ -37,6 +41,40 @@ class InOtherUnits(ReachAvoidProblem):
 
     def avoid_constraints(self, x):
         return LEVELS[1] * self.original.avoid_constraints(x / LENGTHS.to(x))
+
+
+@pytest.mark.parametrize("unit", [2.0**-60, 2.0**-30, 2.0**66])
+def test_levels_in_an_extreme_unit_give_the_same_exits_faces_and_weights(unit):
+    """The squares of the levels leave single precision, or their slopes are below what an optimiser notices."""
+
+    class Thin(DoubleIntegrator):
+        scale = 1.0
+
+        def target_constraints(self, x):
+            return self.scale * (x - x.new_tensor([0.3, 0.2])).square().sum(-1, keepdim=True) - self.scale * 1e-6
+
+        def avoid_constraints(self, x):
+            return self.scale * super().avoid_constraints(x)
+
+    class Scaled(Thin):
+        scale = unit
+
+    rng = torch.Generator().manual_seed(0)
+    x, u = Thin.states.sample(4_000, rng), Thin.controls.sample(4_000, rng)
+    x[:2_000] = x.new_tensor([0.3, 0.2]) + 0.1 * (x[:2_000] - 0.3)
+    outcomes = []
+    for problem in (Thin(), Scaled()):
+        interior = problem.interior(x)
+        step = Simulator(problem, 0.1, 2).step(x[interior], u[interior], torch.Generator().manual_seed(1))
+        faces = find_faces(problem, torch.Generator().manual_seed(0))
+        weights = face_weights(problem, faces.points[::64], faces.values[::64])
+        outcomes.append((step.reached, step.failed, weights.mean(), faces.values.sum()))
+    (reached, failed, weight, count), (*exits, other_weight, other_count) = outcomes
+    assert torch.equal(reached, exits[0])
+    assert torch.equal(failed, exits[1])
+    assert min(reached.sum(), failed.sum()) > 10
+    assert abs(weight - other_weight) < 0.02
+    assert count == other_count == 8_192
 
 
 def test_a_problem_in_other_units_is_learned_alike(tmp_path):

@@ -130,7 +130,9 @@ def slopes(samples: Samples) -> Iterator[Finding]:
 
 def _level(problem: ReachAvoidProblem, what: str) -> Callable[[Tensor], Tensor]:
     """The level (*) of a set, at states (*, n); that of a smoothed payoff for the target."""
-    return problem.avoid_level if what == "avoid set" else lambda x: problem.reached_constraints(x).amax(-1)
+    if what == "avoid set":
+        return problem.scaled_avoid_level
+    return lambda x: problem.scaled_reached_constraints(x).amax(-1)
 
 
 def _sets(samples: Samples):

@@ -168,7 +168,7 @@ def _outward(problem: ReachAvoidProblem, points: Tensor, values: Tensor) -> Tens
     """The gradient (K, n) of the level of the set on whose face a point lies."""
     x = points.detach().requires_grad_()
     with torch.enable_grad():
-        level = problem.avoid_constraints(x).amin(-1)
+        level = problem.scaled_avoid_constraints(x).amin(-1)
         if problem.objective == "reach-avoid":
-            level = torch.where(values > 0.5, problem.reached_constraints(x).amax(-1), level)
+            level = torch.where(values > 0.5, problem.scaled_reached_constraints(x).amax(-1), level)
         return torch.autograd.grad(level.sum(), x)[0]

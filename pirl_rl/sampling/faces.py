@@ -143,10 +143,10 @@ def _sets(problem: ReachAvoidProblem) -> list[tuple[str, Levels, float, list[Lev
     """A and B, as far as they absorb: name, membership, V, and the levels of each part of a union."""
     sets: list[tuple[str, Levels, float, list[Levels]]] = []
     if problem.objective == "reach-avoid":
-        sets.append(("target", problem.reached, 1.0, [problem.reached_constraints]))
+        sets.append(("target", problem.reached, 1.0, [problem.scaled_reached_constraints]))
     if problem.has_avoid_set:
         count = problem.avoid_constraints(problem.states.sample(1, torch.Generator().manual_seed(0))).shape[-1]
-        parts: list[Levels] = [lambda x, i=i: problem.avoid_constraints(x)[..., i : i + 1] for i in range(count)]
+        parts: list[Levels] = [lambda x, i=i: problem.scaled_avoid_constraints(x)[..., i : i + 1] for i in range(count)]
         sets.append(("avoid set", problem.failed, 0.0, parts))
     return sets
 
