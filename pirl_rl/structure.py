@@ -43,7 +43,9 @@ def controlled_channels(problem: ReachAvoidProblem, points: int = 256, seed: int
     x, one, drawn, _ = _random_points(problem, points, seed)
     sigma, found = problem.diffusion(x, one), []
     for axis in range(problem.controls.dim):
-        changed = (problem.diffusion(x, _with_coordinate(one, axis, drawn)) != sigma).any(0).any(0)
+        other = problem.diffusion(x, _with_coordinate(one, axis, drawn))
+        # Inside a set sigma may have no number, which differs from itself.
+        changed = ((other != sigma) & ~(other.isnan() & sigma.isnan())).any(0).any(0)
         found.append(changed.nonzero().squeeze(-1).tolist())
     return found
 
@@ -98,7 +100,8 @@ def _is_affine_between(problem: ReachAvoidProblem, x: Tensor, one: Tensor, other
     share = torch.rand(len(x), 1, generator=rng, dtype=x.dtype)
     expected = (1 - share) * problem.drift(x, one) + share * problem.drift(x, other)
     gap = (problem.drift(x, (1 - share) * one + share * other) - expected).abs()
-    return bool((gap <= ROUNDING * expected.abs().amax(0)).all())
+    # Inside a set the drift may have no number.
+    return bool((gap.nan_to_num(0.0) <= ROUNDING * expected.nan_to_num(0.0).abs().amax(0)).all())
 
 
 def check_problem(problem: ReachAvoidProblem) -> None:

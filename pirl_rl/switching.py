@@ -153,7 +153,7 @@ def _hamiltonian(problem: ReachAvoidProblem, y: Tensor, u: Tensor, rng: torch.Ge
     if curved:
         rows = zip(y, u, up, down, strict=True)  # one state at a time, since sigma may have many entries
         value = value + CURVATURE / 2 * torch.stack([_bend(problem, *row, width) for row in rows])
-    return value
+    return value.nan_to_num(0.0)  # inside a set the physics may have no number, and all controls are alike there
 
 
 def _bend(problem: ReachAvoidProblem, y: Tensor, u: Tensor, up: Tensor, down: Tensor, width: Tensor) -> Tensor:

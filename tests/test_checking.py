@@ -10,10 +10,13 @@ import torch
 import pirl_rl
 import pirl_rl.errors
 from benchmarks.kinds import Orbit
-from pirl_rl import Box, Plane, payoffs, problems
-from pirl_rl.checking import examine, report
+from pirl_rl import Box, Plane, ReachAvoidProblem, payoffs, problems
+from pirl_rl.checking import check, examine, report
 from pirl_rl.commands.check import main
+from pirl_rl.errors import ProblemError
 from pirl_rl.problems import DoubleIntegrator, DubinsCar, HalfSpace, Pendulum, Reach1D, ZermeloBoat
+from pirl_rl.structure import controlled_channels, is_control_affine
+from pirl_rl.switching import switching
 
 
 class WrongShape(ZermeloBoat):
@@ -497,3 +500,34 @@ def test_training_checks_first_and_leaves_nothing_behind(tmp_path):
     with pytest.raises(pirl_rl.errors.ProblemError, match=r"FarTarget\.target_level"):
         pirl_rl.train(FarTarget(), folder=folder)
     assert not folder.exists()
+
+
+class Hollow(ReachAvoidProblem):
+    """Physics and a target whose formulas have no number inside the avoid set, at the centre of the box."""
+
+    horizon, states, controls = 2.0, Box([-1.0, -1.0], [1.0, 1.0]), Box([-1.0], [1.0])
+
+    def drift(self, x, u):
+        return torch.stack([u[..., 0] + 0 * self.gap(x), -self.gap(x)], -1)
+
+    def diffusion(self, x, u):
+        return torch.diag_embed(torch.stack([0.3 + 0 * x[..., 0], 0.1 + 0.1 * self.gap(x)], -1))
+
+    def target_level(self, x):
+        return 0.8 - self.gap(x)
+
+    def avoid_level(self, x):
+        return x.square().sum(-1) - 0.09
+
+    def gap(self, x):
+        return (x.square().sum(-1) - 0.04).sqrt()
+
+
+def test_physics_is_asked_only_outside_the_sets():
+    """What the choices of a training see of it is that of states outside, too."""
+    assert check(Hollow()) == []
+    assert controlled_channels(Hollow()) == [[]]
+    assert is_control_affine(Hollow())
+    assert switching(Hollow()).joint == 0
+    with pytest.raises(ProblemError, match=r"Bare.drift .*expected finite numbers, got NaN"):
+        check(type("Bare", (Hollow,), {"avoid_level": ReachAvoidProblem.avoid_level})())

@@ -39,7 +39,7 @@ COARSE = 0.1
 
 def controls(samples: Samples) -> Iterator[Finding]:
     """Each control should change the drift or the noise at some state."""
-    problem, x, u = samples.problem, samples.x, samples.u
+    problem, (x, u) = samples.problem, samples.outside
     before = _physics(samples, x, u)
     idle = []
     for index in range(u.shape[-1]):
@@ -54,9 +54,9 @@ def controls(samples: Samples) -> Iterator[Finding]:
 
 def noise(samples: Samples) -> Iterator[Finding]:
     """The rank of sigma; without noise V jumps, and a network cannot learn a jump."""
-    problem, x = samples.problem, samples.x
+    problem, (x, u) = samples.problem, samples.outside
     width = 2 * problem.states.center_and_half_width(x)[1]
-    scaled = problem.diffusion(x, samples.u) / width.unsqueeze(-1)
+    scaled = problem.diffusion(x, u) / width.unsqueeze(-1)
     rank = torch.linalg.matrix_rank(scaled).double()
     n = x.shape[-1]
     if float(rank.max()) == 0:
@@ -82,7 +82,7 @@ def units_of_time(samples: Samples) -> Iterator[Finding]:
             unit = "units of the state per s" if part == "drift" else "units of the state per sqrt(s)"
             message = f"it uses {', '.join(used)}, but must return {unit}; the simulator multiplies by the step itself."
             yield found(problem, "warning", part, message)
-    move = across_box(problem, samples.x, samples.u)
+    move = across_box(problem, *samples.outside)
     farthest = max(move.speed * problem.horizon, move.spread * problem.horizon**0.5)
     if farthest < STILL:
         message = (
@@ -141,7 +141,7 @@ def steps(samples: Samples, dt: float | None, substeps: int | None, crossing: Cr
 def _precision(samples: Samples, h: float) -> Iterator[Finding]:
     """Networks and paths are in single precision, which must resolve the moves of an integration step of length h."""
     states = samples.problem.states
-    drift, sigma = _physics(samples, samples.x, samples.u)
+    drift, sigma = _physics(samples, *samples.outside)
     moves = (drift.abs() * h + sigma.norm(dim=-1) * h**0.5).amax(0).tolist()
     for axis, move in enumerate(moves):
         farthest = max(abs(states.low[axis]), abs(states.high[axis]))
@@ -163,6 +163,7 @@ def _alike(samples: Samples, x: Tensor, other: Tensor, u: Tensor) -> bool:
     """Whether drift, noise and membership of both sets are the same at the states x and other (N, n)."""
     problem = samples.problem
     pairs = zip(_physics(samples, x, u), _physics(samples, other, u), strict=True)
-    rates = all(torch.allclose(one, two, rtol=1e-9, atol=1e-9 * float(1 + one.abs().max())) for one, two in pairs)
+    sizes = ((one, two, float(1 + one.nan_to_num(0.0).abs().max())) for one, two in pairs)
+    rates = all(torch.allclose(one, two, rtol=1e-9, atol=1e-9 * size, equal_nan=True) for one, two, size in sizes)
     sets = (problem.reached, problem.failed)
     return rates and all(torch.equal(inside(x), inside(other)) for inside in sets)

@@ -105,12 +105,14 @@ def side_effects(samples: Samples) -> Iterator[Finding]:
 
 
 def finite(samples: Samples) -> Iterator[Finding]:
-    """Results must be finite in the box, and should be beyond it, where paths go too."""
+    """Results must be finite in the box outside A and B, and should be beyond it, where paths go too."""
     for part, method in samples.methods.items():
         for level, x in (("error", samples.x), ("warning", samples.beyond)):
             value = method(x, samples.u).reshape(len(x), -1)
             # A level may be infinite where its set is out of reach, as that of an empty set is.
             bad = (value.isnan() if part in LEVELS else ~value.isfinite()).any(-1)
+            # Inside a set the physics is not asked.
+            bad = bad & (samples.problem.interior(x) | ~samples.problem.states.contains(x))
             if bad.any():
                 where = "in the box of states" if level == "error" else "beyond the box, where paths may go"
                 message = f"expected finite numbers, got NaN or infinite ones at {_share(bad)} of the states {where}."
@@ -136,8 +138,7 @@ def derivatives(samples: Samples) -> Iterator[Finding]:
             yield found(
                 problem, "error", part, f"expected a function that torch can differentiate, got {slope}; {need}."
             )
-        elif part in LEVELS and not slope.isfinite().all():
-            bad = ~slope.isfinite().all(-1)
+        elif part in LEVELS and (bad := ~slope.isfinite().all(-1) & problem.interior(x)).any():
             message = (
                 f"expected finite derivatives, got NaN or infinite ones at {_share(bad)} of the states. A branch of "
                 f"torch.where that is not taken is differentiated too, so give it valid arguments; {need}."

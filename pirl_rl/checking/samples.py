@@ -16,7 +16,7 @@ STATES = 1_024
 """The number of random states in the box, and of those in the box that is half as wide again."""
 
 CORNERS = 64
-"""The largest number of corners of the box that are added."""
+"""The largest numbers of corners of the box and of points half way to its sides that are added."""
 
 BEYOND = 1.5
 """Widths of the box that paths are taken to reach, in widths of `states`."""
@@ -31,7 +31,7 @@ class Samples:
 
     Attributes:
         problem: the problem.
-        x: states (N, n) in the box, with its centre and corners, float64.
+        x: states (N, n) in the box, with its centre, its corners and points half way to its sides, float64.
         u: controls (N, m), half of them vertices.
         beyond: states (N, n) in the wider box, of which most lie outside `states`.
         methods: the methods that the problem defines, as functions of x and u, by name.
@@ -40,7 +40,10 @@ class Samples:
     def __init__(self, problem: ReachAvoidProblem, seed: int = 0):
         rng, states = torch.Generator().manual_seed(seed), problem.states
         corners = torch.tensor([*islice(product((-1.0, 1.0), repeat=states.dim), CORNERS)], dtype=torch.float64)
-        special = states.wrap(states.denormalize(torch.cat([torch.zeros(1, states.dim).double(), corners])))
+        axes = torch.eye(states.dim, dtype=torch.float64)
+        # The centre may lie in a set, and then points beside it show what has no number where a coordinate is 0.
+        special = torch.cat([0 * axes[:1], corners, torch.cat([axes, -axes])[:CORNERS] / 2])
+        special = states.wrap(states.denormalize(special))
         self.problem = problem
         self.x = torch.cat([states.sample(STATES, rng, torch.float64), special])
         self.beyond = states.expand(BEYOND).sample(len(self.x), rng, torch.float64)
@@ -51,6 +54,12 @@ class Samples:
         for name in (*LEVELS, "unreachable"):
             if defines(problem, name):
                 self.methods[name] = _of_states(getattr(problem, name))
+
+    @cached_property
+    def outside(self) -> tuple[Tensor, Tensor]:
+        """Those of the states x outside A and B, where the physics is asked, with their controls u; else all."""
+        outside = self.problem.interior(self.x)
+        return (self.x[outside], self.u[outside]) if outside.any() else (self.x, self.u)
 
     @cached_property
     def faces(self) -> Faces:
