@@ -719,6 +719,33 @@ def test_a_drift_without_a_value_in_a_set_is_not_asked_there():
         assert (value[x[:, 0] < 1.2] < 0.01).all() if tau == 0.5 else (value[x[:, 0] > 1.2] > 0.99).all()
 
 
+class Bottomless(ReachAvoidProblem):
+    """The tank without a set below its bottom, where neither drift nor noise has a number."""
+
+    horizon, controls = 4.0, Box([0.0], [0.5])
+    drift, target_level = Tank.drift, Tank.target_level
+
+    def __init__(self, low: float):
+        super().__init__()
+        self.states = Box([low], [2.0])
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return (0.02 + 0 * x.sqrt()).unsqueeze(-1)
+
+
+@pytest.mark.parametrize(("low", "points", "turns"), [(-0.2, 221, True), (-0.2, 221, False), (0.1, 191, True)])
+def test_paths_fail_where_the_physics_has_no_numbers(low, points, turns):
+    """The tank has the same V as one with an avoid set below its bottom, which is in the box or in its margin."""
+    x = torch.linspace(0.02, 1.48, 60, dtype=torch.float64).unsqueeze(-1)
+    tau = torch.full((60,), 4.0, dtype=torch.float64)
+    kept = GridSolver(Tank(), 201, turns=turns).solve()
+    lost = GridSolver(Bottomless(low), points, turns=turns).solve()
+    assert kept.split == lost.split == turns
+    assert (lost.value(tau, x) - kept.value(tau, x)).abs().max() < 0.01
+    assert (lost.value(tau, x - 1.6) < 0.01).all()
+    assert lost.policy(tau, x).isfinite().all()
+
+
 class Along(ReachAvoidProblem):
     """Motion along the face of the target, with noise across it that is weak beside the mesh."""
 

@@ -73,12 +73,12 @@ def _numbers_of_levels(problem: ReachAvoidProblem, most: int) -> list[int]:
 def _steepest(problem: ReachAvoidProblem, x: Tensor, direction: Tensor, axes: Sequence[np.ndarray]) -> Tensor:
     """The normalised control (M, m) with the largest direction . f(x, u), axis by axis from the middle of the box."""
     action = x.new_zeros(len(x), problem.controls.dim)
-    best = problem.drift(x, problem.controls.denormalize(action)) @ direction
+    best = (problem.drift(x, problem.controls.denormalize(action)) @ direction).nan_to_num(nan=-math.inf)
     for axis in list(range(action.shape[1])) * SWEEPS:
         for mark in axes[axis]:
             trial = action.clone()
             trial[:, axis] = mark
             speed = problem.drift(x, problem.controls.denormalize(trial)) @ direction
             action = torch.where((speed > best).unsqueeze(-1), trial, action)
-            best = torch.maximum(speed, best)
+            best = torch.fmax(speed, best)
     return action

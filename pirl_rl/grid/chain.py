@@ -21,6 +21,8 @@ before that of the other. For large c_k they are upwind differences, of first or
 add noise across the drift, and so c_k stays between -1/q and 1/p there. Offsets along axes take what these leave. What
 is left of F along axes with little or no noise moves by the rate |R_i| / p for the rest R_i > 0, with p of the arm
 along R_i.
+
+Where drift or noise of a control has no number, a path with this control fails, as it does in the simulator.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ import numpy as np
 import torch
 from scipy import sparse
 
-from pirl_rl.grid.mesh import Mesh, absorbed
+from pirl_rl.grid.mesh import Mesh, absorbed, finite
 from pirl_rl.grid.stencil import bounded, decompose
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.structure import has_controlled_noise
@@ -50,6 +52,9 @@ LEAST_WEIGHT = 1e-12
 
 SHORTEST = 1e-3
 """The smallest fraction of an arm; it bounds the rates, and moves a face by at most this share of a node distance."""
+
+LOSSES = 1e9
+"""The rate, in 1/horizon, at which paths fail where the physics has no numbers: at once beside every step."""
 
 
 class Arm(NamedTuple):
@@ -109,10 +114,11 @@ class Chain:
         noise, blocks, gains = None, [], []
         for u in controls[:1] if self.shared else controls:
             control = torch.from_numpy(np.ascontiguousarray(u))
-            drift = problem.drift(x, control).numpy() * (moves / mesh.spacing)
+            drift, sigma = problem.drift(x, control), problem.diffusion(x, control)
+            lost = ~sigma.isfinite().all(-1).all(-1) | (moves & ~drift.isfinite().all(-1))
             if noise is None or controlled:
-                noise = self._noise(problem.diffusion(x, control).numpy())
-            rates, gain = self._assembled(drift, noise)
+                noise = self._noise(finite(sigma))
+            rates, gain = self._assembled(finite(drift) * (moves / mesh.spacing), noise, lost.numpy())
             blocks.append(rates)
             gains.append(gain)
         self._rates: Any = sparse.vstack(blocks, format="csr")
@@ -173,8 +179,11 @@ class Chain:
                 directions.append((weight, offset, self._arm(offset), self._arm(-offset)))
         return Noise(inverse, directions)
 
-    def _assembled(self, drift: np.ndarray, noise: Noise) -> tuple[sparse.csr_array, np.ndarray]:
-        """The rates (M, M) and the gain (M,) of one candidate with its drift (M, n), in units of the mesh per s."""
+    def _assembled(self, drift: np.ndarray, noise: Noise, lost: np.ndarray) -> tuple[sparse.csr_array, np.ndarray]:
+        """The rates (M, M) and the gain (M,) of one candidate with its drift (M, n), in units of the mesh per s.
+
+        Paths from the nodes that are `lost` (M,) bool fail.
+        """
         jumps, rest = [], drift.copy()
         slope = np.einsum("pij,pj->pi", np.broadcast_to(noise.inverse, (len(drift), *noise.inverse.shape[1:])), drift)
         # Axes come last, and take what oblique offsets have left.
@@ -198,7 +207,7 @@ class Chain:
             jumps.append((forward, rest[:, axis].clip(0) / forward.fraction))
             jumps.append((backward, (-rest[:, axis]).clip(0) / backward.fraction))
         size = len(drift)
-        gain, out = np.zeros(size), np.zeros(size)
+        gain, out = np.zeros(size), lost * (LOSSES / self._problem.horizon)
         rows, columns, rates = [], [], []
         for arm, rate in jumps:
             gain += rate * arm.value

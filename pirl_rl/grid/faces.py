@@ -49,7 +49,7 @@ def mean_beyond_faces(
     All states have the same normal numbers, those of a scrambled Sobol sequence, so that V is the same in every call
     and nearly continuous in x. Whether a path crosses a face between the ends of a step is not drawn. The path goes on
     with the probability that it has not, see `pirl_rl.crossings.crossing_probability`. Paths that cross a face of A and
-    one of B in the same step count as failures.
+    one of B in the same step count as failures, and so do paths where the physics has no numbers.
 
     Args:
         problem: the physics.
@@ -109,7 +109,9 @@ def _step(problem: ReachAvoidProblem, spacing: Tensor, policy: Function, tau: Te
     h = torch.minimum(tau, 1 / rate.clamp(min=1e-12))
     middle = midpoint_drift(problem, x, u, drift, h.unsqueeze(-1))
     moved = x + middle * h.unsqueeze(-1) + times(sigma, normal) * h.sqrt().unsqueeze(-1)
-    moved, reached, failed = problem.states.wrap(moved), torch.zeros_like(h), torch.zeros_like(h)
+    lost = ~moved.isfinite().all(-1)
+    moved, h = torch.where(lost.unsqueeze(-1), x, problem.states.wrap(moved)), h.masked_fill(lost, 0.0)
+    reached, failed = torch.zeros_like(h), torch.zeros_like(h)
     path, within = (x, moved, sigma, h), problem.states.within_period
     if problem.has_avoid_set:
         # One constraint of B suffices, and all of A must hold. The noise of different faces is taken as independent.
@@ -118,4 +120,4 @@ def _step(problem: ReachAvoidProblem, spacing: Tensor, policy: Function, tau: Te
     if problem.objective == "reach-avoid":
         crossed = crossing_probability(within(problem.reached_constraints), *path, "farthest")
         reached = (1 - failed) * crossed.prod(-1)
-    return moved, h, reached, failed
+    return moved, h, reached.masked_fill(lost, 0.0), failed.masked_fill(lost, 1.0)

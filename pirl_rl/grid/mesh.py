@@ -84,17 +84,22 @@ def absorbed(problem: ReachAvoidProblem, x: np.ndarray) -> tuple[np.ndarray, np.
     return reached | failed, (reached & ~failed).astype(float)
 
 
+def finite(values: torch.Tensor) -> np.ndarray:
+    """The values, with 0 in place of those that are not finite, as the physics may have no numbers at some states."""
+    return np.nan_to_num(values.numpy(), nan=0.0, posinf=0.0, neginf=0.0)
+
+
 def default_margin(problem: ReachAvoidProblem, samples: int = 4096) -> np.ndarray:
     """How far (n,) the box is widened on each side, in SI units, from drift and noise at sampled states and controls.
 
     It is the way that the drift goes out and back within the horizon and `DEVIATIONS` standard deviations of the noise,
-    but at most `WIDEST`, and 0 on periodic axes.
+    but at most `WIDEST`, and 0 on periodic axes. States without finite drift and noise, as inside a set, do not count.
     """
     rng = torch.Generator().manual_seed(0)
     x = problem.states.sample(samples, rng, torch.float64)
     u = problem.controls.sample(samples, rng, torch.float64)
-    speed = problem.drift(x, u).abs().amax(0).numpy()
-    noise = problem.diffusion(x, u).norm(dim=-1).amax(0).numpy()
+    speed = finite(problem.drift(x, u).abs()).max(0)
+    noise = finite(problem.diffusion(x, u).norm(dim=-1)).max(0)
     margin = speed * problem.horizon / 2 + DEVIATIONS * noise * problem.horizon**0.5
     width = np.array(problem.states.high) - problem.states.low
     margin = np.minimum(margin, WIDEST[problem.states.dim] * width)

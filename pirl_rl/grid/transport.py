@@ -31,7 +31,7 @@ import torch
 from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, minimum_filter, spline_filter
 
 from pirl_rl.crossings import squared_noise
-from pirl_rl.grid.mesh import Mesh, absorbed
+from pirl_rl.grid.mesh import Mesh, absorbed, finite
 from pirl_rl.passages import entrance_probability, passage_probability
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import midpoint_drift
@@ -61,9 +61,9 @@ def is_weak(problem: ReachAvoidProblem, mesh: Mesh, x: np.ndarray, controls: np.
     points, variance, drift = torch.from_numpy(x), np.zeros_like(x), np.zeros_like(x)
     for u in controls:
         control = torch.from_numpy(np.ascontiguousarray(u))
-        sigma = problem.diffusion(points, control).numpy() / mesh.spacing[:, None]
+        sigma = finite(problem.diffusion(points, control)) / mesh.spacing[:, None]
         variance = np.maximum(variance, (sigma**2).sum(-1))
-        drift = np.maximum(drift, np.abs(problem.drift(points, control).numpy() / mesh.spacing))
+        drift = np.maximum(drift, np.abs(finite(problem.drift(points, control)) / mesh.spacing))
     return bool((drift > WEAK * variance).any(-1).mean() > 0.5)
 
 
@@ -74,7 +74,7 @@ def speed_limit(problem: ReachAvoidProblem, mesh: Mesh, x: np.ndarray, controls:
     The fastest of all would make steps too short, where a few states have large forces.
     """
     points = torch.from_numpy(x)
-    drifts = (problem.drift(points, torch.from_numpy(np.ascontiguousarray(u))).numpy() for u in controls)
+    drifts = (finite(problem.drift(points, torch.from_numpy(np.ascontiguousarray(u)))) for u in controls)
     return max(float(np.quantile([np.abs(drift / mesh.spacing).max(-1) for drift in drifts], 0.9)), 1e-12)
 
 
@@ -172,21 +172,24 @@ def _noise_acts_on_faces(problem: ReachAvoidProblem, x: torch.Tensor, u: torch.T
 def _flow(problem: ReachAvoidProblem, mesh: Mesh, x: torch.Tensor, u: torch.Tensor, dt: float):
     """Where paths without noise from x (M, n) are after dt.
 
+    A path fails where the drift leads to no number, unless it has entered A or B before.
+
     Returns:
-        The states (M, n) within their periods, whether the paths entered A or B before (M,), and the value of the first
-        of these sets (M,).
+        The states (M, n) within their periods, whether the paths ended in A or B or without a number before (M,), and
+        the value of the first of these (M,).
     """
     wrap = problem.states.wrap
-    cells = np.abs(problem.drift(x, u).numpy() / mesh.spacing).max() * dt
+    cells = np.abs(finite(problem.drift(x, u)) / mesh.spacing).max() * dt
     looks = max(1, int(np.ceil(LOOKS * cells)))
     h, ended, end = dt / looks, np.zeros(len(x), bool), np.zeros(len(x))
     for _ in range(looks):
         moved = wrap(x + midpoint_drift(problem, x, u, problem.drift(x, u), h) * h)
-        # Inside a set the drift need not have a value, as that of a tank below its bottom.
-        x = torch.where(moved.isfinite(), moved, x)
+        # The drift need not have a number everywhere, as that of a tank below its bottom.
+        lost = ~moved.isfinite().all(-1)
+        x = torch.where(lost.unsqueeze(-1), x, moved)
         inside, value = absorbed(problem, x.numpy())
-        end = np.where(inside & ~ended, value, end)
-        ended = ended | inside
+        end = np.where(inside & ~ended, value * ~lost.numpy(), end)
+        ended = ended | inside | lost.numpy()
     return x, ended, end
 
 
@@ -218,4 +221,4 @@ def _passed(
     else:
         succeeded = (1 - passage_probability(within(problem.avoid_constraints), *path)).prod(-1)
     inside = torch.where(torch.from_numpy(end > 0), problem.reached(moved), problem.failed(moved))
-    return np.where(ended & ~inside.numpy(), end, succeeded.numpy())
+    return np.where(ended & ~inside.numpy(), end, finite(succeeded))
