@@ -16,7 +16,7 @@ from pirl_rl.grid.chain import Chain
 from pirl_rl.grid.march import Continuation, March
 from pirl_rl.grid.mesh import LEAST_ACROSS, Mesh, absorbed, default_margin, make_mesh, resolves_target
 from pirl_rl.grid.solution import GridSolution
-from pirl_rl.grid.transport import FARTHEST, Transport, is_weak, speed_limit
+from pirl_rl.grid.transport import FARTHEST, Transport, is_weak, noise_limit, speed_limit
 from pirl_rl.problem import ReachAvoidProblem
 
 POINTS = {1: 401, 2: 121, 3: 51}
@@ -27,6 +27,13 @@ MOST_STEPS = 6
 
 FIRST = 2.0
 """The number of cells through which a control is held from tau = 0, where drift and noise act in turns."""
+
+BROAD = 1.0
+"""The largest deviation of the noise, in cells, in the time for which that control is held.
+
+A drift that is slow everywhere would lead through two cells only after a long time, in which the best control changes
+and noise that depends on the state does, too. A layer that is as wide as a cell needs no held control.
+"""
 
 
 class GridSolver:
@@ -129,7 +136,8 @@ class GridSolver:
             transport = Transport(problem, mesh, nodes[free], controls, problem.horizon / steps)
             speed = speed_limit(problem, mesh, nodes[free], controls)
             # A smoothed payoff does not jump at tau = 0.
-            first = 0 if problem.payoff.epsilon else math.ceil(FIRST * steps / (problem.horizon * speed))
+            held = min(FIRST / speed, BROAD**2 / noise_limit(problem, mesh, nodes[free], controls))
+            first = 0 if problem.payoff.epsilon else min(math.ceil(held * steps / problem.horizon), steps)
             levels = march.in_turns(value, transport, first)
         else:
             levels = march.together(value)

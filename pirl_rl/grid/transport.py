@@ -78,6 +78,15 @@ def speed_limit(problem: ReachAvoidProblem, mesh: Mesh, x: np.ndarray, controls:
     return max(float(np.quantile([np.abs(drift / mesh.spacing).max(-1) for drift in drifts], 0.9)), 1e-12)
 
 
+def noise_limit(problem: ReachAvoidProblem, mesh: Mesh, x: np.ndarray, controls: np.ndarray) -> float:
+    """The variance of the noise, in squared cells per s, that nine in ten nodes x (M, n) have at most, along the axis
+    and with the control (K, M, m) with the most noise."""
+    points = torch.from_numpy(x)
+    sigmas = (finite(problem.diffusion(points, torch.from_numpy(np.ascontiguousarray(u)))) for u in controls)
+    variances = [((sigma / mesh.spacing[:, None]) ** 2).sum(-1).max(-1) for sigma in sigmas]
+    return max(float(np.quantile(variances, 0.9)), 1e-12)
+
+
 class Transport:
     """Moves V along the flow under the best candidate control.
 
