@@ -749,6 +749,35 @@ def test_a_drift_without_a_value_in_a_set_is_not_asked_there():
         assert (value[x[:, 0] < 1.2] < 0.01).all() if tau == 0.5 else (value[x[:, 0] > 1.2] > 0.99).all()
 
 
+class Walled(ReachAvoidProblem):
+    """Come to x >= 0.5 with weak noise. Below the box a force grows beyond 1e9; it counts how often it is asked for."""
+
+    horizon, asked = 1.0, 0
+    states, controls = Box([-1.0], [1.0]), Box([-1.0], [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        self.asked += 1
+        assert self.asked < 50_000
+        return u + (20 * (-1 - x)).exp()
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return (0.05 + 0 * x).unsqueeze(-1)
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return 0.5 - x[..., 0]
+
+
+def test_a_large_force_in_the_margin_does_not_ask_for_steps_without_end():
+    """To follow the force would take more than 1e9 looks in a step. In the box V is a first passage at the speed 1."""
+    solution = GridSolver(Walled(), points=101).solve()
+    assert solution.split
+    x = torch.linspace(-0.8, 0.45, 40, dtype=torch.float64).unsqueeze(-1)
+    tau = torch.ones(40, dtype=torch.float64)
+    error = (solution.value(tau, x) - first_passage(tau, 0.5 - x[:, 0], 1.0, 0.05)).abs()
+    assert error.mean() < 0.005
+    assert (error <= solution.error(tau, x) + 0.01).all()
+
+
 class Bottomless(ReachAvoidProblem):
     """The tank without a set below its bottom, where neither drift nor noise has a number."""
 

@@ -49,6 +49,10 @@ PADDING = 8
 LOOKS = 2
 """The number of looks for A and B on a path through one cell."""
 
+MOST_LOOKS = 1_000
+"""The largest number of looks in a step: no path is followed through more than 500 cells. Most go through two at most,
+and only nodes with large forces, as in the margin of the mesh, ask for more."""
+
 BLUR = 1.0
 """The standard deviation, in cells, of the filter through which candidates see V."""
 
@@ -187,12 +191,16 @@ def _flow(problem: ReachAvoidProblem, mesh: Mesh, x: torch.Tensor, u: torch.Tens
         The states (M, n) within their periods, whether the paths ended in A or B or without a number before (M,), and
         the value of the first of these (M,).
     """
-    wrap = problem.states.wrap
+    wrap, spacing = problem.states.wrap, torch.from_numpy(mesh.spacing)
     cells = np.abs(finite(problem.drift(x, u)) / mesh.spacing).max() * dt
-    looks = max(1, int(np.ceil(LOOKS * cells)))
+    looks = max(1, int(np.ceil(min(LOOKS * cells, MOST_LOOKS))))
     h, ended, end = dt / looks, np.zeros(len(x), bool), np.zeros(len(x))
     for _ in range(looks):
-        moved = wrap(x + midpoint_drift(problem, x, u, problem.drift(x, u), h) * h)
+        way = midpoint_drift(problem, x, u, problem.drift(x, u), h) * h
+        if LOOKS * cells > MOST_LOOKS:
+            # Longer ways would lead past the place to which a large force drives, and past sets.
+            way = way / (LOOKS * way / spacing).abs().amax(-1, keepdim=True).clamp(min=1)
+        moved = wrap(x + way)
         # The drift need not have a number everywhere, as that of a tank below its bottom.
         lost = ~moved.isfinite().all(-1)
         x = torch.where(lost.unsqueeze(-1), x, moved)
