@@ -293,6 +293,43 @@ def test_a_control_inside_the_box_may_be_the_best():
     assert (problem.exact_value(tau, x) - few.value(tau, x)).max() > 0.05
 
 
+class Crowded(ReachAvoidProblem):
+    """Four controls move a state together, and a fifth sets its noise alone: reach x >= 1."""
+
+    horizon = 1.0
+    states, controls = Box([-1.0], [1.2]), Box([-1.0] * 4 + [0.2], [1.0] * 4 + [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return 0.25 * u[..., :4].sum(-1, keepdim=True)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return u[..., 4:, None]
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return 1 - x[..., 0]
+
+
+class Evasive(Crowded):
+    """Stay below x = 1."""
+
+    objective = "invariance"
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        return 1 - x[..., 0]
+
+
+@pytest.mark.parametrize(
+    ("problem", "states", "best"),
+    [(Crowded(), (-0.5, 0.2), [1.0] * 5), (Evasive(), (0.5, 0.95), [-1.0] * 4 + [0.2])],
+)
+def test_a_control_of_the_noise_alone_is_found_among_many_controls(problem, states, best):
+    """At a distance that the full speed does not cover the most noise is best, and to stay away the least noise is."""
+    solution = GridSolver(problem, points=111).solve()
+    x = torch.linspace(*states, 12, dtype=torch.float64).unsqueeze(-1)
+    policy = solution.policy(torch.full((12,), 0.5, dtype=torch.float64), x)
+    torch.testing.assert_close(policy, policy.new_tensor(best).expand(12, 5))
+
+
 @pytest.mark.parametrize(
     ("problem", "numbers"),
     [(Loiter(), [3, 33]), (Gusty(), [11, 11]), (DubinsCar(), [3]), (VehicleDrift3(), [5, 5]), (Bicycle(), [3, 9])],

@@ -7,7 +7,9 @@ while the others stand still, as the speed beside the heading, still has three.
 
 With more controls the tensor product is too large. Then there is one candidate for each direction p in which grad V
 may point: the control with the largest p . f(x, u), found axis by axis, which is exact for an affine drift and a sigma
-without u. Their number depends on n and their cost is linear in m.
+without u. Where sigma depends on u there are two more for each direction, which have the largest and the smallest
+p . f(x, u) +- |sigma(x, u)|^2 / 2 in units of the mesh, since much noise may be good or bad. Their number depends on n
+and their cost is linear in m.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ import torch
 from torch import Tensor
 
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.structure import is_affine_in, is_control_affine
+from pirl_rl.structure import has_controlled_noise, is_affine_in, is_control_affine
 
 FEW = 32
 """The largest number of candidates in a tensor product where vertices are enough: three controls have 27."""
@@ -52,10 +54,12 @@ def candidates(problem: ReachAvoidProblem, x: np.ndarray, spacing: np.ndarray, l
     if math.prod(numbers) <= most:
         chosen = controls.denormalize(torch.tensor(list(product(*axes)), dtype=torch.float64)).numpy()
         return np.broadcast_to(chosen[:, None], (len(chosen), len(x), m))
-    points = torch.from_numpy(x)
+    points, distances = torch.from_numpy(x), torch.from_numpy(spacing)
+    signs = (-1, 0, 1) if has_controlled_noise(problem) else (0,)
     steepest = [
-        _steepest(problem, points, torch.tensor(direction / spacing), axes)
+        _steepest(problem, points, distances, torch.tensor(direction, dtype=torch.float64), sign, axes)
         for direction in product((-1, 0, 1), repeat=x.shape[1])
+        for sign in signs
     ]
     return controls.denormalize(torch.stack(steepest)).numpy()
 
@@ -70,15 +74,27 @@ def _numbers_of_levels(problem: ReachAvoidProblem, most: int) -> list[int]:
     return [VERTEX_LEVELS if bound else many for bound in at_bounds]
 
 
-def _steepest(problem: ReachAvoidProblem, x: Tensor, direction: Tensor, axes: Sequence[np.ndarray]) -> Tensor:
-    """The normalised control (M, m) with the largest direction . f(x, u), axis by axis from the middle of the box."""
+def _steepest(
+    problem: ReachAvoidProblem, x: Tensor, spacing: Tensor, direction: Tensor, sign: int, axes: Sequence[np.ndarray]
+) -> Tensor:
+    """The normalised control (M, m) with the largest direction . f(x, u) + sign |sigma(x, u)|^2 / 2, in units of the
+    mesh, axis by axis from the middle of the box."""
+
+    def score(action: Tensor) -> Tensor:
+        u = problem.controls.denormalize(action)
+        speed = problem.drift(x, u) @ (direction / spacing)
+        if sign:
+            variance = (problem.diffusion(x, u) / spacing[:, None]).square().sum((-2, -1))
+            speed = speed + sign * variance / 2
+        return speed.nan_to_num(nan=-math.inf)
+
     action = x.new_zeros(len(x), problem.controls.dim)
-    best = (problem.drift(x, problem.controls.denormalize(action)) @ direction).nan_to_num(nan=-math.inf)
+    best = score(action)
     for axis in list(range(action.shape[1])) * SWEEPS:
         for mark in axes[axis]:
             trial = action.clone()
             trial[:, axis] = mark
-            speed = problem.drift(x, problem.controls.denormalize(trial)) @ direction
-            action = torch.where((speed > best).unsqueeze(-1), trial, action)
-            best = torch.fmax(speed, best)
+            found = score(trial)
+            action = torch.where((found > best).unsqueeze(-1), trial, action)
+            best = torch.maximum(found, best)
     return action
