@@ -572,6 +572,26 @@ def test_a_target_of_few_nodes_is_pointed_out_since_the_estimate_misses_its_erro
     assert find_truth(problem, 10, 0, {2: 61}).source == "none"
 
 
+class Slit(Reach1D):
+    """A target that is seen at three quarters of the way between two nodes, and between no nodes twice as far apart."""
+
+    states = Box([-1.0], [1.0])
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return (x[..., 0] - 0.0375).abs() - 0.004
+
+
+def test_a_solution_whose_half_mesh_misses_the_target_is_kept_and_its_error_is_unknown(tmp_path):
+    tau, x = points(Slit(), 50)
+    with pytest.warns(UserWarning, match="the error of the grid is not known, and its estimate is 1"):
+        solution = GridSolver(Slit(), points=41).solve()
+    assert torch.equal(solution.value(tau, x), GridSolver(Slit(), points=41, estimate=False).solve().value(tau, x))
+    solution.save(tmp_path / "grid.npz")
+    for kept in (solution, GridSolution.load(tmp_path / "grid.npz", Slit())):
+        assert (kept.error(tau, x) == 1).all()
+        assert kept.largest_error == 1
+
+
 @pytest.mark.parametrize(
     ("problem", "count", "resolved"),
     [

@@ -44,6 +44,8 @@ class GridSolution:
         coarse: the solution with half as many points and steps, or None, and then the error is not known.
         split: whether drift and noise acted in turns, see `pirl_rl.grid.transport`. V is then extrapolated by `SHARE`
             alone, and near faces it is the mean over short paths, see `pirl_rl.grid.faces`.
+        unseen: an error that the coarse solution cannot show, in [0, 1], which `error` adds; 1 says that the error is
+            not known, as V lies in [0, 1].
     """
 
     def __init__(
@@ -56,9 +58,10 @@ class GridSolution:
         nearest: np.ndarray,
         coarse: GridSolution | None = None,
         split: bool = False,
+        unseen: float = 0.0,
     ):
         self.problem, self.mesh, self.coarse, self.split = problem, mesh, coarse, split
-        self.field = Field(problem, mesh, values)
+        self.field, self.unseen = Field(problem, mesh, values), unseen
         self._policy, self._controls, self._nearest = policy, controls, nearest
 
     dtype, device = torch.float64, torch.device("cpu")
@@ -113,6 +116,7 @@ class GridSolution:
             "controls": self._controls,
             "nearest": self._nearest,
             "split": np.array(self.split),
+            "unseen": np.array(self.unseen),
         }
         coarse = {} if self.coarse is None else self.coarse.arrays()
         return arrays | {f"coarse_{name}": array for name, array in coarse.items()}
@@ -124,8 +128,9 @@ class GridSolution:
             arrays[prefix + name] for name in ("values", "policy", "controls", "nearest")
         )
         mesh = Mesh(low, spacing, shape.tolist(), periodic.tolist())
-        split = bool(arrays.get(f"{prefix}split", False))  # files of earlier versions lack it
-        return cls(problem, mesh, values, policy, controls, nearest, split=split)
+        # Files of earlier versions lack these.
+        split, unseen = bool(arrays.get(f"{prefix}split", False)), float(arrays.get(f"{prefix}unseen", 0.0))
+        return cls(problem, mesh, values, policy, controls, nearest, split=split, unseen=unseen)
 
     def raw_value(self, tau: Tensor, x: Tensor) -> Tensor:
         """V (P,) as `value` gives it; a grid has no other."""
@@ -197,18 +202,22 @@ class GridSolution:
         the face within a layer that is thinner than the cell. Where V is linear in such cells, both solutions are near
         the value of the set close to the face, and so the largest of the distances at x and at the corners counts.
         Where drift and noise act in turns, V may jump, and both solutions smear a jump alike. Large second differences
-        of V show this, and count where they are larger than the distance.
+        of V show this, and count where they are larger than the distance. What neither can show is added, see `unseen`.
 
         Raises:
             ArgumentError: the solution was computed without an estimate, or a tau is outside [0, horizon].
         """
-        if self.coarse is None:
+        if self.coarse is None and not self.unseen:
             raise ArgumentError("error: expected a solution with an estimate, got one of GridSolver(estimate=False)")
-        x = self.problem.states.wrap(x)
+        seen = self.field(tau, x) * 0 if self.coarse is None else self._seen(tau, self.problem.states.wrap(x))
+        return (seen + self.unseen).clamp(max=1)
+
+    def _seen(self, tau: Tensor, x: Tensor) -> Tensor:
+        """The part (P,) of `error` that both solutions show, at states (P, n) within their periods."""
         error = self._distance(tau, x)
         if self.split:
             return torch.maximum(error, self._bend(tau, x))
-        cut = ~self.coarse.field.uncut(x)
+        cut = ~self.coarse.field.uncut(x)  # type: ignore[union-attr]
         for nodes in self.mesh.corners(x[cut].detach().double().cpu().numpy())[0]:
             corners = torch.from_numpy(self.mesh.states(self.mesh.indices()[nodes])).to(x)
             distance = self._distance(tau[cut], corners).where(self.problem.interior(corners), 0.0)

@@ -94,7 +94,8 @@ class GridSolver:
         """The value and the policy.
 
         Raises:
-            ArgumentError: no node is outside A and B, or none is next to the target.
+            ArgumentError: no node is outside A and B, or none is next to the target. With half the points this is a
+                warning, and the estimate of the error is 1, which says that nothing is known of it.
         """
         if self.estimate and not self.resolves_target:
             warnings.warn(
@@ -106,7 +107,16 @@ class GridSolver:
         if self.estimate:
             half = tuple(max((count + 1) // 2, 3) for count in self.points)
             # Both have the same scheme, or their distance would not be an estimate of the error.
-            solution.coarse = self._solved(half, (max(solution.steps // 2, 1), solution.split))
+            scheme = max(solution.steps // 2, 1), solution.split
+            try:
+                solution.coarse = self._solved(half, scheme)
+            except ArgumentError as error:
+                solution.unseen = 1.0
+                warnings.warn(
+                    f"the error of the grid is not known, and its estimate is 1, because half the points are too few "
+                    f"({error}); expected more points than {self.points}",
+                    stacklevel=2,
+                )
         return solution
 
     def _solved(self, points: Sequence[int], scheme: tuple[int, bool] | None = None) -> GridSolution:
