@@ -15,6 +15,7 @@ from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.grid import GridSolution, GridSolver
 from pirl_rl.grid.candidates import candidates
+from pirl_rl.grid.mesh import default_margin
 from pirl_rl.passages import first_passage
 from pirl_rl.payoffs import LipschitzPayoff
 from pirl_rl.problems import (
@@ -590,6 +591,56 @@ def test_a_solution_whose_half_mesh_misses_the_target_is_kept_and_its_error_is_u
     for kept in (solution, GridSolution.load(tmp_path / "grid.npz", Slit())):
         assert (kept.error(tau, x) == 1).all()
         assert kept.largest_error == 1
+
+
+class Broad(ReachAvoidProblem):
+    """Brownian motion whose noise is three times as wide as the box: V = 2 Phi(-(1 - x)/(3 sqrt(tau)))."""
+
+    horizon = 1.0
+    states, controls = Box([0.0], [1.0]), Box([-1.0], [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.zeros_like(x)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.full_like(x, 3.0).unsqueeze(-1)
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return 1 - x[..., 0]
+
+    def exact_value(self, tau: Tensor, x: Tensor) -> Tensor:
+        return first_passage(tau, 1 - x[..., 0], 0.0, 3.0)
+
+
+class Swept(Broad):
+    """A current sweeps every path into x >= 3 in time, beyond the mesh, which ends one width beside the box: V = 0."""
+
+    objective = "invariance"
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.full_like(x, 5.0)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.full_like(x, 0.3).unsqueeze(-1)
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        return 3 - x[..., 0]
+
+    def exact_value(self, tau: Tensor, x: Tensor) -> Tensor:
+        return torch.zeros_like(tau)
+
+
+@pytest.mark.parametrize("problem", [Broad(), Swept()], ids=lambda problem: type(problem).__name__)
+def test_a_margin_that_was_limited_is_pointed_out_and_counts_in_the_estimate_where_it_changes_the_value(problem):
+    x = torch.linspace(0.05, 0.95, 19, dtype=torch.float64).unsqueeze(-1)
+    tau = torch.ones(19, dtype=torch.float64)
+    with pytest.warns(UserWarning, match=r"margin: the mesh goes beyond .* by \[1.0\]; .* expected margin=\["):
+        solution = GridSolver(problem, points=101).solve()
+    error = (solution.value(tau, x) - problem.exact_value(tau, x)).abs()
+    assert error.max() > 0.1
+    assert (error <= solution.error(tau, x) + 0.01).all()
+    wide = GridSolver(problem, points=101, margin=default_margin(problem).tolist()).solve()
+    assert (wide.value(tau, x) - problem.exact_value(tau, x)).abs().max() < 0.01
 
 
 @pytest.mark.parametrize(

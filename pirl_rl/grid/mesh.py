@@ -21,6 +21,9 @@ DEVIATIONS = 3.0
 WIDEST = {1: 1.0, 2: 1.0, 3: 0.5}
 """The largest margin on a side, in widths of `states`, by the number of states: in three dimensions it costs most."""
 
+WIDER = {1: 10.0, 2: 2.0, 3: 2.0}
+"""The largest margin of the mesh with which V is compared where the margin was limited, in units of the limited one."""
+
 LEAST_ACROSS = 4
 """The least number of nodes in a row in the target along each axis with which an estimate of the error is trusted.
 
@@ -89,11 +92,17 @@ def finite(values: torch.Tensor) -> np.ndarray:
     return np.nan_to_num(values.numpy(), nan=0.0, posinf=0.0, neginf=0.0)
 
 
+def widest_margin(problem: ReachAvoidProblem) -> np.ndarray:
+    """The largest margin (n,) that is chosen, in SI units, see `WIDEST`."""
+    return WIDEST[problem.states.dim] * (np.array(problem.states.high) - problem.states.low)
+
+
 def default_margin(problem: ReachAvoidProblem, samples: int = 4096) -> np.ndarray:
-    """How far (n,) the box is widened on each side, in SI units, from drift and noise at sampled states and controls.
+    """How far (n,) the box should be widened on each side, in SI units, from drift and noise at sampled states.
 
     It is the way that the drift goes out and back within the horizon and `DEVIATIONS` standard deviations of the noise,
-    but at most `WIDEST`, and 0 on periodic axes. States without finite drift and noise, as inside a set, do not count.
+    and 0 on periodic axes. The mesh goes as far, but at most by `widest_margin`. States
+    without finite drift and noise, as inside a set, do not count.
     """
     rng = torch.Generator().manual_seed(0)
     x = problem.states.sample(samples, rng, torch.float64)
@@ -101,8 +110,6 @@ def default_margin(problem: ReachAvoidProblem, samples: int = 4096) -> np.ndarra
     speed = finite(problem.drift(x, u).abs()).max(0)
     noise = finite(problem.diffusion(x, u).norm(dim=-1)).max(0)
     margin = speed * problem.horizon / 2 + DEVIATIONS * noise * problem.horizon**0.5
-    width = np.array(problem.states.high) - problem.states.low
-    margin = np.minimum(margin, WIDEST[problem.states.dim] * width)
     margin[list(problem.states.periodic)] = 0.0
     return margin
 

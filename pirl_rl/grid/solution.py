@@ -44,8 +44,8 @@ class GridSolution:
         coarse: the solution with half as many points and steps, or None, and then the error is not known.
         split: whether drift and noise acted in turns, see `pirl_rl.grid.transport`. V is then extrapolated by `SHARE`
             alone, and near faces it is the mean over short paths, see `pirl_rl.grid.faces`.
-        unseen: an error that the coarse solution cannot show, in [0, 1], which `error` adds; 1 says that the error is
-            not known, as V lies in [0, 1].
+        unseen: errors (N,) at the nodes, in [0, 1], that the coarse solution cannot show. `error` adds them. None means
+            none, and 1 says that the error is not known, as V lies in [0, 1].
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class GridSolution:
         nearest: np.ndarray,
         coarse: GridSolution | None = None,
         split: bool = False,
-        unseen: float = 0.0,
+        unseen: np.ndarray | None = None,
     ):
         self.problem, self.mesh, self.coarse, self.split = problem, mesh, coarse, split
         self.field, self.unseen = Field(problem, mesh, values), unseen
@@ -116,8 +116,9 @@ class GridSolution:
             "controls": self._controls,
             "nearest": self._nearest,
             "split": np.array(self.split),
-            "unseen": np.array(self.unseen),
         }
+        if self.unseen is not None:
+            arrays["unseen"] = self.unseen
         coarse = {} if self.coarse is None else self.coarse.arrays()
         return arrays | {f"coarse_{name}": array for name, array in coarse.items()}
 
@@ -128,8 +129,8 @@ class GridSolution:
             arrays[prefix + name] for name in ("values", "policy", "controls", "nearest")
         )
         mesh = Mesh(low, spacing, shape.tolist(), periodic.tolist())
-        # Files of earlier versions lack these.
-        split, unseen = bool(arrays.get(f"{prefix}split", False)), float(arrays.get(f"{prefix}unseen", 0.0))
+        split = bool(arrays.get(f"{prefix}split", False))  # files of earlier versions lack it
+        unseen = arrays.get(f"{prefix}unseen")
         return cls(problem, mesh, values, policy, controls, nearest, split=split, unseen=unseen)
 
     def raw_value(self, tau: Tensor, x: Tensor) -> Tensor:
@@ -207,10 +208,14 @@ class GridSolution:
         Raises:
             ArgumentError: the solution was computed without an estimate, or a tau is outside [0, horizon].
         """
-        if self.coarse is None and not self.unseen:
+        if self.coarse is None and self.unseen is None:
             raise ArgumentError("error: expected a solution with an estimate, got one of GridSolver(estimate=False)")
-        seen = self.field(tau, x) * 0 if self.coarse is None else self._seen(tau, self.problem.states.wrap(x))
-        return (seen + self.unseen).clamp(max=1)
+        x = self.problem.states.wrap(x)
+        error = torch.zeros_like(tau, dtype=x.dtype) if self.coarse is None else self._seen(tau, x)
+        if self.unseen is not None:
+            nodes, weights = self.mesh.corners(x.detach().double().cpu().numpy())
+            error = error + torch.from_numpy((weights * self.unseen[nodes]).sum(0)).to(error)
+        return error.clamp(max=1)
 
     def _seen(self, tau: Tensor, x: Tensor) -> Tensor:
         """The part (P,) of `error` that both solutions show, at states (P, n) within their periods."""

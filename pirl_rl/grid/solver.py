@@ -14,7 +14,16 @@ from pirl_rl.errors import ArgumentError
 from pirl_rl.grid.candidates import candidates
 from pirl_rl.grid.chain import Chain
 from pirl_rl.grid.march import Continuation, March
-from pirl_rl.grid.mesh import LEAST_ACROSS, Mesh, absorbed, default_margin, make_mesh, resolves_target
+from pirl_rl.grid.mesh import (
+    LEAST_ACROSS,
+    WIDER,
+    Mesh,
+    absorbed,
+    default_margin,
+    make_mesh,
+    resolves_target,
+    widest_margin,
+)
 from pirl_rl.grid.solution import GridSolution
 from pirl_rl.grid.transport import FARTHEST, Transport, is_weak, noise_limit, speed_limit
 from pirl_rl.problem import ReachAvoidProblem
@@ -35,6 +44,9 @@ A drift that is slow everywhere would lead through two cells only after a long t
 and noise that depends on the state does, too. A layer that is as wide as a cell needs no held control.
 """
 
+NOTICED, WIDESPREAD = 0.01, 0.05
+"""A wider mesh is asked for where it changes V by more than the first at more than the second share of the nodes."""
+
 
 class GridSolver:
     """Solves the HJB equation of a problem on a mesh.
@@ -47,7 +59,8 @@ class GridSolver:
             beside the mesh it is larger, up to `MOST_STEPS` times, where most paths would lead through more than two
             cells in a step: drift and noise can act in turns only with shorter steps, see `pirl_rl.grid.transport`.
         margin: how far the mesh goes beyond `problem.states` on each side, in SI units, one number for each axis. The
-            default follows from drift, noise and horizon, see `pirl_rl.grid.mesh.default_margin`.
+            default follows from drift, noise and horizon, see `pirl_rl.grid.mesh.default_margin`, but is at most
+            `WIDEST`. Where it is limited so, and an estimate is asked for, V is compared with that of a wider mesh.
         levels: number of levels of each control among the candidates, at least 2; the default follows from the
             problem, see `pirl_rl.grid.candidates`.
         estimate: whether the problem is solved with half the points and steps, too, for an estimate of the error.
@@ -77,10 +90,12 @@ class GridSolver:
         for name, number in (("steps", steps), ("levels", levels)):
             if number is not None and number < 2:
                 raise ArgumentError(f"{name}: expected a number >= 2, got {number}")
-        self.margin = default_margin(problem) if margin is None else np.array(margin, float)
+        self.wanted = default_margin(problem) if margin is None else np.array(margin, float)
+        self.margin = self.wanted if margin is not None else np.minimum(self.wanted, widest_margin(problem))
         if self.margin.shape != (n,) or not (self.margin >= 0).all():
             raise ArgumentError(f"margin: expected {n} numbers >= 0, got {margin}")
-        self.margin[list(problem.states.periodic)] = 0.0  # a wider period would be another circle
+        for distance in (self.margin, self.wanted):
+            distance[list(problem.states.periodic)] = 0.0  # a wider period would be another circle
         self.problem, self.steps, self.levels, self.estimate = problem, steps, levels, estimate
         self.turns = turns
 
@@ -110,8 +125,9 @@ class GridSolver:
             scheme = max(solution.steps // 2, 1), solution.split
             try:
                 solution.coarse = self._solved(half, scheme)
+                solution.unseen = self._beyond_margin(half, scheme, solution.coarse, solution.mesh)
             except ArgumentError as error:
-                solution.unseen = 1.0
+                solution.unseen = np.ones(solution.mesh.size)
                 warnings.warn(
                     f"the error of the grid is not known, and its estimate is 1, because half the points are too few "
                     f"({error}); expected more points than {self.points}",
@@ -119,15 +135,45 @@ class GridSolver:
                 )
         return solution
 
-    def _solved(self, points: Sequence[int], scheme: tuple[int, bool] | None = None) -> GridSolution:
+    def _beyond_margin(
+        self, points: Sequence[int], scheme: tuple[int, bool], coarse: GridSolution, fine: Mesh
+    ) -> np.ndarray | None:
+        """The change of V (N,) at the horizon and the nodes of `fine`, if the mesh goes further beyond the box.
+
+        It is None where the margin was not limited, or all nodes beyond it lie in A or B, and 0 beside faces, since by
+        rounding a node on a face may lie in the set on one of both meshes alone. A large change is pointed out.
+        """
+        problem = self.problem
+        margin = np.minimum(self.wanted, WIDER[problem.states.dim] * self.margin)
+        if make_mesh(problem, points, margin).shape == coarse.mesh.shape:
+            return None
+        x = torch.from_numpy(fine.states(fine.indices()))
+        tau, wider = torch.full((len(x),), problem.horizon, dtype=x.dtype), self._solved(points, scheme, margin)
+        near = coarse.field.near_faces(x)
+        change = (wider.field(tau, x) - coarse.field(tau, x)).abs().masked_fill(near, 0.0)
+        inside = change[problem.states.contains(x) & problem.interior(x)]
+        share = (inside > NOTICED).double().mean().item()
+        if share > WIDESPREAD:
+            warnings.warn(
+                f"margin: the mesh goes beyond the box of states by {_listed(self.margin)}; with {_listed(margin)} V "
+                f"changes by more than {NOTICED} at {share:.0%} of the nodes in the box, and by up to "
+                f"{inside.max():.2g}; expected margin={_listed(self.wanted)}",
+                stacklevel=3,
+            )
+        return change.numpy()
+
+    def _solved(
+        self, points: Sequence[int], scheme: tuple[int, bool] | None = None, margin: np.ndarray | None = None
+    ) -> GridSolution:
         """The solution without an estimate.
 
         Args:
             points: the numbers of nodes across `problem.states` along each axis.
             scheme: the number of steps, and whether drift and noise act in turns; by default they follow from the
                 problem and the mesh.
+            margin: how far the mesh goes beyond `problem.states` (n,), in SI units, by default by `self.margin`.
         """
-        problem, mesh = self.problem, make_mesh(self.problem, points, self.margin)
+        problem, mesh = self.problem, make_mesh(self.problem, points, self.margin if margin is None else margin)
         nodes = mesh.states(mesh.indices())
         inside, fixed = absorbed(problem, nodes)
         free = np.flatnonzero(~inside)
@@ -181,3 +227,8 @@ class GridSolver:
         """Which of the nodes x (M, n) lie in the box of states (M,); all of them if none does."""
         inside = self.problem.states.contains(torch.from_numpy(x)).numpy()
         return inside | (not inside.any())
+
+
+def _listed(margin: np.ndarray) -> list[float]:
+    """The numbers of a margin (n,) for a message."""
+    return [float(f"{distance:.3g}") for distance in margin]

@@ -24,7 +24,8 @@ TRAINING = {
 GRID = {
     "wall_seconds": "The time of the solution, in s.",
     "grid_nodes": "The number of nodes of the mesh.",
-    "grid_error": "The largest difference at tau = T from the solution with half as many points and steps.",
+    "grid_error": "The largest difference at tau = T from the solution with half as many points and steps. "
+    "What a wider mesh would change is added, and it is 1 where the error is not known.",
 }
 """The meanings of what a run with method=grid writes."""
 
