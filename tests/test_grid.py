@@ -452,7 +452,7 @@ class Belt(ReachAvoidProblem):
         return Calming().exact_value(tau, x[..., :1])
 
 
-def test_first_steps_end_where_the_noise_covers_a_cell_however_slow_the_drift_is():
+def test_first_steps_end_where_the_noise_covers_four_cells_however_slow_the_drift_is():
     """The belt moves by less than two cells in all. With first steps up to the horizon it is 0.004 and 0.038 off."""
     problem = Belt()
     tau, x = points(problem, 1_000)

@@ -37,11 +37,11 @@ MOST_STEPS = 6
 FIRST = 2.0
 """The number of cells through which a control is held from tau = 0, where drift and noise act in turns."""
 
-BROAD = 1.0
+BROAD = 4.0
 """The largest deviation of the noise, in cells, in the time for which that control is held.
 
 A drift that is slow everywhere would lead through two cells only after a long time, in which the best control changes
-and noise that depends on the state does, too. A layer that is as wide as a cell needs no held control.
+and noise that depends on the state does, too. A layer that is wider than a cell needs no held control.
 """
 
 NOTICED, WIDESPREAD = 0.01, 0.05
