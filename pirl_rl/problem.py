@@ -244,7 +244,7 @@ def with_indicator(problem: ReachAvoidProblem) -> ReachAvoidProblem:
     """A copy of the problem whose payoff is the indicator, so that to come to A itself is a success."""
     hard = copy.copy(problem)
     hard.payoff = Indicator()
-    hard.__dict__.pop("_reached_units", None)  # they belong to the set of the payoff
+    vars(hard).pop("_reached_units", None)  # they belong to the set of the payoff
     return hard
 
 

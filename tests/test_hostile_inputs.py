@@ -236,7 +236,7 @@ def run(trained):
 
 
 def contents(folder: Path) -> dict[Path, bytes]:
-    """The files of a folder but for the lock of a run and what Python caches."""
+    """The files of a folder except the lock of a run and what Python caches."""
     ignored = (RunDirectory.LOCK.name, "__pycache__")
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file() and not {*ignored} & {*path.parts}}
 

@@ -1,7 +1,7 @@
 """The trace of the generator from random vectors: exact on average, with its square and the gradient of that.
 
 For w channels the probes take 2^w values with equal probabilities, so that a mean over all of them is an expectation
-and is exact but for rounding.
+and is exact except for rounding.
 """
 
 from __future__ import annotations

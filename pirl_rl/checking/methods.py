@@ -173,7 +173,7 @@ def _same(one: Tensor, other: Tensor) -> bool:
 
 
 def _rows_equal(one: Tensor, other: Tensor) -> Tensor:
-    """Whether the rows of two results (N, ...) are the same but for rounding, (N,) bool."""
+    """Whether the rows of two results (N, ...) are the same except for rounding, (N,) bool."""
     one, other = one.double(), other.double()
     size = one.nan_to_num(0.0, 0.0, 0.0).abs().amax(0)
     same = (one == other) | (one.isnan() & other.isnan()) | ((one - other).abs() <= CLOSE * size)

@@ -101,8 +101,8 @@ def default_margin(problem: ReachAvoidProblem, samples: int = 4096) -> np.ndarra
     """How far (n,) the box should be widened on each side, in SI units, from drift and noise at sampled states.
 
     It is the way that the drift goes out and back within the horizon and `DEVIATIONS` standard deviations of the noise,
-    and 0 on periodic axes. The mesh goes as far, but at most by `widest_margin`. States
-    without finite drift and noise, as inside a set, do not count.
+    and 0 on periodic axes. The mesh goes as far, but at most by `widest_margin`. States without finite drift and noise,
+    as inside a set, do not count.
     """
     rng = torch.Generator().manual_seed(0)
     x = problem.states.sample(samples, rng, torch.float64)

@@ -22,7 +22,7 @@ Tau = Literal["fixed", "random", "both"]
 class InitialStates(Protocol):
     """A distribution of the initial states of episodes.
 
-    A class with the attribute `common = True` promises that its states depend neither on V nor on `visited`, but for
+    A class with the attribute `common = True` promises that its states depend neither on V nor on `visited`, except for
     those of a distribution in its attribute `others`. Trainings that play together on a GPU then draw theirs at once.
     """
 

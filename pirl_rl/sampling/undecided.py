@@ -38,7 +38,7 @@ class UndecidedStates:
         candidates: the number of candidates for each state, >= 1.
 
     Attributes:
-        groups: the states are in the order (groups, *), and each group is drawn from its own candidates; 1 but for
+        groups: the states are in the order (groups, *), and each group is drawn from its own candidates; 1 except for
             several trainings that play together, each of which has its own V.
 
     Raises:

@@ -40,7 +40,7 @@ class Truth:
 
     Attributes:
         tau: times to go (N,), in s, uniform above a tenth of the horizon.
-        x: states (N, n), uniform in the part of the box outside A and B, but for those at which a grid is in doubt.
+        x: states (N, n), uniform in the part of the box outside A and B, except those at which a grid is in doubt.
         value: V (N,), or None where neither a closed form nor a grid gives it.
         source: "exact", "grid" or "none".
         error: the mean of the grid's estimate of its own error, 0 for exact values.
