@@ -56,7 +56,7 @@ class Step(NamedTuple):
         reached: paths that reached A (N,) bool.
         failed: paths that entered B or were lost (N,) bool; none of them counts as reached.
         noise: the sum of sigma dW over the sub-steps (N, n) until the path ended, in the units of the state. Its mean
-            given the state before the step is zero, except for paths that are lost, because it stops at a stopping time.
+            given the state before the step is zero, except for paths that are lost, as it stops at a stopping time.
     """
 
     state: Tensor

@@ -155,7 +155,7 @@ def test_every_constructor_argument_is_a_key(overrides):
 
 @pytest.mark.parametrize("method", ["pirl", "td3"])
 def test_what_differs_from_the_constructors_stands_in_the_method_and_its_recipe(method):
-    """What conf/ composes for reach1d is the default of each constructor, except for what a method or a group chooses."""
+    """What conf/ composes for reach1d is the default of each constructor, except what a method or a group chooses."""
     config = compose("train", ["+experiment=reach1d", f"method={method}"])
     chosen = {key for key, _ in owned(method)} | {"schedule.center", "schedule.steepness"}
     chosen |= {f"{simulator}.{name}" for simulator in ("env", "evaluation.simulator") for name in ("dt", "substeps")}
