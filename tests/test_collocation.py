@@ -260,7 +260,37 @@ def test_a_set_that_is_not_found_is_named(problem):
     with pytest.raises(
         ProblemError, match=rf"{type(problem).__name__}: no point of the target was found, neither .* nor"
     ):
-        BoundarySampler(problem)
+        BoundarySampler(problem).sample(make_rng())
+
+
+class Discs(Reach1D):
+    """Many obstacles in a plane; it counts the states at which their levels are asked."""
+
+    states = Box([-1.0, -1.0], [1.0, 1.0])
+    centers = torch.stack([*torch.meshgrid(torch.linspace(-0.8, 0.8, 6), torch.linspace(-0.6, 0.6, 3), indexing="ij")])
+    asked = 0
+
+    def avoid_constraints(self, x):
+        Discs.asked += len(x)
+        return (x.unsqueeze(-1) - self.centers.flatten(1).to(x)).norm(dim=-2) - 0.12
+
+
+def test_the_faces_of_many_parts_are_found_together():
+    """Each of 18 discs has its share of the points, and all together are asked at 1,500,000 states at most."""
+    faces = find_faces(Discs(), make_rng())
+    x = faces.points[faces.values < 0.5]
+    distance = (x.unsqueeze(-1) - Discs.centers.flatten(1)).norm(dim=-2)
+    count = distance.argmin(-1).bincount(minlength=18)
+    assert (distance.amin(-1) - 0.12).abs().max() < 1e-6
+    assert (count > 200).all()
+    assert Discs.asked < 1_500_000
+
+
+def test_faces_are_not_searched_before_points_are_drawn():
+    """In a training in which the boundary has no weight, none are."""
+    Discs.asked = 0
+    BoundarySampler(Discs())
+    assert Discs.asked == 0
 
 
 def test_faces_that_the_problem_gives_are_taken():

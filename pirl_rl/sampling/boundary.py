@@ -20,7 +20,7 @@ from torch import Tensor
 from pirl_rl import recording
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.sampling.faces import FACE_POOL, find_faces
+from pirl_rl.sampling.faces import FACE_POOL, Faces, find_faces
 from pirl_rl.sampling.initial_states import sample_interior
 
 RESOLVED = 0.05
@@ -47,7 +47,6 @@ class BoundarySampler:
 
     Raises:
         ArgumentError: a number is out of range.
-        ProblemError: a set of the problem is not found.
     """
 
     def __init__(
@@ -70,11 +69,16 @@ class BoundarySampler:
         if not 0 <= replay_share <= 1:
             raise ArgumentError(f"boundary.replay_share: expected 0 <= replay_share <= 1, got {replay_share}")
         self.replay_share, self.box = replay_share, problem.states.expand(widen)
-        self._pool = find_faces(problem, torch.Generator().manual_seed(seed))
+        self.seed = seed
+
+    @cached_property
+    def _pool(self) -> Faces:
+        """The points on the faces, which are not searched where the boundary has no weight in the loss."""
+        return find_faces(self.problem, torch.Generator().manual_seed(self.seed))
 
     @cached_property
     def _weights(self) -> Tensor:
-        """The weights of the pool, which are not needed where the boundary has no weight in the loss."""
+        """The weights of the pool."""
         points, values = self._pool.points, self._pool.values
         if self.problem.faces(1, torch.Generator()) is not None:
             return torch.ones_like(values)
@@ -115,6 +119,9 @@ class BoundarySampler:
 
         Returns:
             A TensorDict with "tau" (N, 1), in s, "state" (N, n), "value" (N,) and "weight" (N,).
+
+        Raises:
+            ProblemError: a set of the problem is not found.
         """
         device = rng.device
         state = self._interior(rng)

@@ -25,6 +25,9 @@ FACE_POOL = 16_384
 DESCENTS = 256
 """The number of states from which the levels of each part of a set are descended."""
 
+MOST_PARTS = 16
+"""The number of parts of a union from which each of them has fewer descents, so that all together have no more."""
+
 
 class Faces(NamedTuple):
     """Points on the faces of A and B.
@@ -60,9 +63,13 @@ def find_faces(problem: ReachAvoidProblem, rng: torch.Generator) -> Faces:
     if len(interior) < DESCENTS:
         interior = torch.cat([interior, sample_interior(problem, problem.states, DESCENTS, rng, torch.float64)])
     found = []
-    for name, absorbs, value, levels in _sets(problem):
-        parts = [_inside(absorbs, part, candidates, problem, rng) for part in levels]
-        parts = [ways for ways in parts if ways]
+    for name, absorbs, value, levels, columns in _sets(problem):
+        # All parts are asked at once, since a union may have many.
+        holds, absorbed = levels(candidates) <= 0, absorbs(candidates)
+        sampled = [candidates[holds[:, part].all(-1) & absorbed] for part in columns]
+        descents = min(DESCENTS, max(1, MOST_PARTS * DESCENTS // len(columns)))
+        pairs = zip(columns, sampled, strict=True)
+        parts = [ways for pair in pairs if (ways := _inside(absorbs, levels, *pair, descents, problem, rng))]
         if not parts:
             raise ProblemError(
                 f"{type(problem).__name__}: no point of the {name} was found, neither among {len(candidates)} points "
@@ -139,32 +146,39 @@ class NearFaces:
 Levels = Callable[[Tensor], Tensor]
 
 
-def _sets(problem: ReachAvoidProblem) -> list[tuple[str, Levels, float, list[Levels]]]:
-    """A and B, as far as they absorb: name, membership, V, and the levels of each part of a union."""
-    sets: list[tuple[str, Levels, float, list[Levels]]] = []
+def _sets(problem: ReachAvoidProblem) -> list[tuple[str, Levels, float, Levels, list[slice]]]:
+    """A and B, as far as they absorb: name, membership, V, the levels, and which of them each part of a union has."""
+    sets: list[tuple[str, Levels, float, Levels, list[slice]]] = []
     if problem.objective == "reach-avoid":
-        sets.append(("target", problem.reached, 1.0, [problem.scaled_reached_constraints]))
+        sets.append(("target", problem.reached, 1.0, problem.scaled_reached_constraints, [slice(None)]))
     if problem.has_avoid_set:
         count = problem.avoid_constraints(problem.states.sample(1, torch.Generator().manual_seed(0))).shape[-1]
-        parts: list[Levels] = [lambda x, i=i: problem.scaled_avoid_constraints(x)[..., i : i + 1] for i in range(count)]
-        sets.append(("avoid set", problem.failed, 0.0, parts))
+        columns = [slice(index, index + 1) for index in range(count)]
+        sets.append(("avoid set", problem.failed, 0.0, problem.scaled_avoid_constraints, columns))
     return sets
 
 
 def _inside(
-    absorbs: Levels, part: Levels, candidates: Tensor, problem: ReachAvoidProblem, rng: torch.Generator
+    absorbs: Levels,
+    levels: Levels,
+    part: slice,
+    sampled: Tensor,
+    count: int,
+    problem: ReachAvoidProblem,
+    rng: torch.Generator,
 ) -> list[Tensor]:
-    """Points (K, n) of a part of a set: the candidates in it, and points found by descent, as far as there are any.
+    """Points (K, n) of a part of a set: those that were sampled, and others that so many descents find, as far as there
+    are any.
 
-    A few candidates are joined to the others, since they would be drawn again and again.
+    A few sampled points are joined to the others, since they would be drawn again and again.
     """
 
-    def kept(x: Tensor) -> Tensor:
-        return x[(part(x) <= 0).all(-1) & absorbs(x)]
+    def of_part(x: Tensor) -> Tensor:
+        return levels(x)[..., part]
 
-    sampled, starts = kept(candidates), problem.states.sample(DESCENTS, rng, candidates.dtype)
-    few = len(sampled) < DESCENTS
-    deep = kept(descended(part, starts, problem.states, STEPS if few else FEWER_STEPS))
+    starts, few = problem.states.sample(count, rng, sampled.dtype), len(sampled) < DESCENTS
+    deep = descended(of_part, starts, problem.states, STEPS if few else FEWER_STEPS)
+    deep = deep[(of_part(deep) <= 0).all(-1) & absorbs(deep)]
     return [inside for inside in ([torch.cat([sampled, deep])] if few else [sampled, deep]) if len(inside)]
 
 
