@@ -140,6 +140,12 @@ def check_problem(problem: ReachAvoidProblem) -> None:
             f"{name}.diffusion: expected at least one column, got none; without noise it is one of zeros"
         )
     _expect_shape(f"{name}.diffusion", sigma, (16, n, sigma.shape[-1]))
+    for part in ("target_constraints", "avoid_constraints"):
+        if getattr(type(problem), part) is not getattr(ReachAvoidProblem, part):
+            levels = getattr(problem, part)(few)
+            if levels.ndim != 2 or len(levels) != 16 or not levels.shape[-1]:
+                message = "expected shape (16, k) for 16 states, one column for each of k >= 1 constraints, got"
+                raise ProblemError(f"{name}.{part}: {message} {tuple(levels.shape)}")
     _expect_shape(f"{name}.avoid_level", problem.avoid_level(few), (16,))
     if problem.objective == "reach-avoid":
         _expect_shape(f"{name}.target_level", problem.target_level(few), (16,))

@@ -234,6 +234,19 @@ class ColumnAvoid(Reach1D):
         return x + 3
 
 
+class FlatConstraints(Reach1D):
+    def avoid_constraints(self, x):
+        return x[..., 0] + 3
+
+
+class NoConstraints(ReachAvoidProblem):
+    horizon, states, controls = 1.0, Box([-2.0], [2.0]), Box([-1.0], [1.0])
+    drift, diffusion = Reach1D.drift, Reach1D.diffusion
+
+    def target_constraints(self, x):
+        return x[..., :0]
+
+
 @pytest.mark.parametrize(
     ("problem", "message"),
     [
@@ -243,6 +256,8 @@ class ColumnAvoid(Reach1D):
         (FlatDiffusion, r"FlatDiffusion.diffusion: expected shape \(\*, 1, w\), got \(16, 1\)"),
         (WideDiffusion, r"WideDiffusion.diffusion: expected shape \(16, 1, 3\) for 16 states, got \(16, 2, 3\)"),
         (ColumnTarget, r"ColumnTarget.target_level: expected shape \(16,\) for 16 states, got \(16, 1\)"),
+        (FlatConstraints, r"FlatConstraints.avoid_constraints: expected shape \(16, k\) .*, got \(16,\)"),
+        (NoConstraints, r"NoConstraints.target_constraints: expected shape \(16, k\) .*, got \(16, 0\)"),
         (ColumnAvoid, r"ColumnAvoid.avoid_level: expected shape \(16,\) for 16 states, got \(16, 1\)"),
     ],
 )
