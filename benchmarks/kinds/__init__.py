@@ -1,15 +1,15 @@
 """Problems of other kinds than those of the suite, each written as a user would write it."""
 
 from benchmarks.kinds.approaches import Chain, Pursuit, Rendezvous, Unicycle
-from benchmarks.kinds.compartments import Anaesthesia, LotkaVolterra, Rooms
+from benchmarks.kinds.compartments import Anaesthesia, LotkaVolterra, LynxAndHare, Rooms
 from benchmarks.kinds.cycles import JetLag, PowerSwing, Runaway, Searchlight
 from benchmarks.kinds.demands import Backburn, ChemoWard, IslandGrid, VaccineStock
 from benchmarks.kinds.masses import Crosswind, Gusty, Lander, Orbit, Servo, Sprint, VanDerPol
 from benchmarks.kinds.mixtures import Bearing, Mirror, Mixture
-from benchmarks.kinds.passages import FastRiver, Glider, SlotChange, TwoLink
+from benchmarks.kinds.passages import FastRiver, Glider, SlotChange, StraitFerry, TwoLink
 from benchmarks.kinds.plants import Epidemic, Investor, Reactor, Reservoir, Toggle, Tokens, TwoTanks
 from benchmarks.kinds.stores import FastCharge, Ferment, Fishery, Forager
-from benchmarks.kinds.swings import Duffing, MountainCar, Swingup
+from benchmarks.kinds.swings import Duffing, MountainCar, QuietStance, Swingup
 from benchmarks.kinds.vehicles import Bicycle, Evader, Loiter, Ring, River, Slalom, Steering, TwoCars, TwoHarbours
 from pirl_rl import ReachAvoidProblem
 
@@ -20,6 +20,6 @@ KINDS += (VanDerPol, TwoHarbours, River, Loiter, Crosswind, Bicycle, Tokens, Lan
 KINDS += (Investor, Runaway, JetLag, Searchlight, PowerSwing, Forager, Ferment, FastCharge, SlotChange, TwoLink)
 KINDS += (Bearing, Mirror, Duffing, MountainCar, Swingup, Pursuit, Rooms, Anaesthesia)
 KINDS += (LotkaVolterra, Chain, Unicycle, Rendezvous, FastRiver, Glider, Reactor, Fishery)
-KINDS += (VaccineStock, Backburn, ChemoWard, IslandGrid)
+KINDS += (VaccineStock, Backburn, ChemoWard, IslandGrid, StraitFerry, QuietStance, LynxAndHare)
 
 PROBLEMS = {kind.__name__: kind for kind in KINDS}

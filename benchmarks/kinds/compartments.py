@@ -1,4 +1,4 @@
-"""Rooms, a patient and a lake: what is in several compartments must stay or come between limits."""
+"""Rooms, a patient, a lake and a game reserve: what is in several compartments must stay or come between limits."""
 
 from __future__ import annotations
 
@@ -76,3 +76,27 @@ class LotkaVolterra(ReachAvoidProblem):
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
         return x - 0.2
+
+
+class LynxAndHare(ReachAvoidProblem):
+    """Both populations of a game reserve must stay between extinction and pest for eight years by culling, per year.
+
+    The states are hares per square kilometre and lynx per ten square kilometres.
+    """
+
+    objective = "invariance"
+    horizon = 8.0
+    states, controls = Box([30.0, 5.0], [260.0, 32.0]), Box([0.0, 0.0], [0.7, 0.7])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        hares, lynx = x.unbind(-1)
+        eaten = 12.0 * hares / (90.0 + hares.clamp(min=0.0))
+        growth = 1.6 * hares * (1.0 - hares / 400.0) - eaten * lynx - u[..., 0] * hares
+        return rows(growth, (0.1 * eaten - 0.35 - u[..., 1]) * lynx)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.diag_embed(x * x.new_tensor([0.4, 0.24]))
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        hares, lynx = x.unbind(-1)
+        return rows((hares - 30.0) / 230.0, (260.0 - hares) / 230.0, (lynx - 5.0) / 27.0, (32.0 - lynx) / 27.0)

@@ -1,4 +1,4 @@
-"""A satellite, an arm, a boat and a glider: obstacles are passed on either side, or against time."""
+"""A satellite, an arm, a boat, a ferry and a glider: obstacles are passed on either side, or against time."""
 
 from __future__ import annotations
 
@@ -121,3 +121,32 @@ class Glider(ReachAvoidProblem):
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
         return x[..., 1:]
+
+
+class StraitFerry(ReachAvoidProblem):
+    """A ferry has to come to one of two harbours on the far side of a strait, past an island; km and hours.
+
+    The current is faster than the ferry except beside the shores. The controls are the speeds through the water along
+    and across the strait.
+    """
+
+    horizon = 3.0
+    states, controls = Box([-8.0, 0.0], [14.0, 8.0]), Box([-3.5, -2.5], [3.0, 2.5])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        current = 20.0 * x[..., 1] * (8.0 - x[..., 1]) / 64.0
+        return u + rows(current, torch.zeros_like(current))
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        sea = 0.6 + 0.7 * (math.pi * x[..., 1] / 8.0).sin() ** 2  # rougher in the middle
+        return torch.diag_embed(rows(sea, 0.8 * sea))
+
+    def target_level(self, x: Tensor) -> Tensor:
+        large = (x - x.new_tensor([9.0, 6.6])).norm(dim=-1) - 1.2
+        small = (x - x.new_tensor([-1.0, 7.0])).norm(dim=-1) - 0.8
+        return torch.minimum(large, small)
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        island = (x - x.new_tensor([3.0, 4.5])).norm(dim=-1) - 1.4
+        along, across = x.unbind(-1)
+        return rows(island, along + 8.0, 14.0 - along, across, 8.0 - across)

@@ -1,4 +1,4 @@
-"""A mass in two wells, a car in a valley and a pendulum, whose force is too weak for the direct way."""
+"""A mass in two wells, a car in a valley, a pendulum and a person on a shaking platform, whose forces are weak."""
 
 from __future__ import annotations
 
@@ -71,3 +71,27 @@ class Swingup(ReachAvoidProblem):
     def target_constraints(self, x: Tensor) -> Tensor:
         angle, speed = x.unbind(-1)
         return rows(math.cos(0.3) - torch.cos(angle), speed - 1, -1 - speed)
+
+
+class QuietStance(ReachAvoidProblem):
+    """A person on a shaking platform must not fall for 6 s: lean in degrees, rate in deg/s, torque of the ankle in N m.
+
+    The torque is weaker at the heel than at the toes, and its noise grows with its size.
+    """
+
+    objective = "invariance"
+    horizon = 6.0
+    states, controls = Box([-5.0, -20.0], [9.0, 20.0]), Box([-45.0], [100.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        lean, rate = x.unbind(-1)
+        torque = 687.0 * torch.deg2rad(lean).sin() - u[..., 0]
+        return rows(rate, torch.rad2deg(torque / 92.0))
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        jerk = torch.rad2deg((9.0 + 0.1 * u.abs()) / 92.0)
+        return torch.stack([torch.zeros_like(jerk), jerk], -2)
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        lean, rate = x.unbind(-1)
+        return rows(lean + 5.0, 9.0 - lean, 20.0 - rate.abs())
