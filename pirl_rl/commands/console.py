@@ -185,8 +185,8 @@ def reported(folder: Path, one_of_many: bool = False, again: Sequence[str] = ())
         _end(f"error: {_one_line(error)}", one_of_many)
     except Exception as error:
         place = _users_place(error)
-        told = place or (isinstance(error, OSError) and error.errno in UNWRITABLE)
-        if not told or (place and os.environ.get("HYDRA_FULL_ERROR") == "1"):
+        known = place or (isinstance(error, OSError) and error.errno in UNWRITABLE)
+        if not known or (place and os.environ.get("HYDRA_FULL_ERROR") == "1"):
             traceback.print_exc()
         if isinstance(error, OSError) and not place:
             _end(f"error: {error.strerror or error}: {error.filename or folder}", one_of_many)
