@@ -78,7 +78,7 @@ def watch(trainer: Trainer, clock: Clock) -> None:
     clock.watch(learner, "update", "update: the rest")
     clock.watch(learner.gradients, "critic", "update: critic loss and gradient")
     clock.watch(learner.gradients, "actor", "update: actor loss and gradient")
-    clock.watch(learner.targets, "step", "update: target networks")
+    clock.watch(learner, "step_targets", "update: target networks")
     for name in ("critic", "actor"):
         for optimizer in getattr(learner, f"{name}_optimizers"):
             clock.watch(optimizer, "step", f"update: optimiser of the {name}, {type(optimizer).__name__}")

@@ -44,7 +44,8 @@ class Stage:
         exploration_noise: standard deviation of the noise on played actions, which are normalised to [-1, 1]. Where it
             changes, the replay buffer is emptied, since its actions come from another policy.
         learning_rate: the initial learning rate; it decays over the stage. That of the run decays over the run.
-        train_actor: False freezes the actor, so that the critics learn the value of one fixed policy.
+        train_actor: False freezes the actor, so that the critics learn the value of one fixed policy. An actor that
+            the stage before has trained is frozen at its target network, a mean over the last updates.
 
     Raises:
         ArgumentError: a number is out of range.
@@ -107,6 +108,11 @@ class Curriculum:
     def is_first(self, update: int) -> bool:
         """Whether an update is the first of its stage."""
         return update in self._firsts
+
+    def freezes(self, update: int) -> bool:
+        """Whether an update is the first of a stage that freezes an actor which the stage before has trained."""
+        trains = [self.stage(k).train_actor for k in (update - 1, update)] if update > 0 else []
+        return self.is_first(update) and trains == [True, False]
 
     def stage(self, update: int) -> Stage:
         """The stage of an update."""

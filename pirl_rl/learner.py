@@ -40,6 +40,10 @@ class Learner:
         polyak: the rate, in (0, 1], at which the target networks follow the networks.
         target_warmup: a number w >= 0. The rate of update j of the target networks, counted from 0, is at least
             w/(w + j), so that V travels through the horizon within the first updates.
+        actor_polyak: a rate of the target actor of its own, which is at least 1/(1 + j) at its update j, so that the
+            target is the mean of the actor's parameters at first. None is the rate of the target critics. A slow
+            target suits critics without the action as input, whose targets need no target actor: it is where the
+            actor comes to rest, see `settle_actor`.
         compile: whether the losses are compiled. Where that fails, as without a C++ compiler, they run eagerly after
             one warning.
 
@@ -56,6 +60,7 @@ class Learner:
         actor_every: int = 2,
         polyak: float = 0.005,
         target_warmup: int = 0,
+        actor_polyak: float | None = None,
         compile: bool = True,
     ):
         if decay not in ("cosine", "constant"):
@@ -71,14 +76,18 @@ class Learner:
         self.learning_rate, self.decay, self.actor_every = learning_rate, decay, actor_every
         if target_warmup < 0:
             raise ArgumentError(f"learner.target_warmup: expected a number >= 0, got {target_warmup}")
-        self.polyak, self.target_warmup = polyak, target_warmup
-        self.targets = FusedSoftUpdate(loss, tau=polyak)
+        if actor_polyak is not None and not 0 < actor_polyak <= 1:
+            raise ArgumentError(f"learner.actor_polyak: expected a number in (0, 1], got {actor_polyak}")
+        self.polyak, self.target_warmup, self.actor_polyak = polyak, target_warmup, actor_polyak
+        self.target_critics = FusedSoftUpdate(loss, "qvalue_network", polyak)
+        self.target_actor = FusedSoftUpdate(loss, "actor_network", actor_polyak or polyak)
         device, rate = loss.td_weight.device, learning_rate
         self._largest: Tensor | None = None
         if recording.records(device):
             # What changes from one update to the next lies in memory that stays, for recordings of updates.
             rate = torch.full((), learning_rate, device=device)
-            self.targets.eps = torch.full((), 1 - polyak, device=device)
+            for target in (self.target_critics, self.target_actor):
+                target.eps = torch.full((), target.eps, device=device)
             self._largest = torch.zeros((), device=device)
         self.critic_optimizers = optimizers(loss.qvalue_network_params, rate, optimizer)
         self.actor_optimizers = optimizers(loss.actor_network_params, rate, optimizer)
@@ -139,8 +148,8 @@ class Learner:
     def prepare(self, weights: Weights, decay: float, k: int) -> None:
         """Set the loss weights, the learning rate and the rate of the targets; arguments are those of `update`."""
         numbers = dict(zip(WEIGHTS, weights, strict=True))
-        follow = max(self.polyak, self._early_rate(k // self.actor_every))
-        numbers |= {"learning_rate": self.rate(decay), "kept": 1 - follow}
+        critics, actor = self._target_rates(k // self.actor_every)
+        numbers |= {"learning_rate": self.rate(decay), "target_critics": 1 - critics, "target_actor": 1 - actor}
         for name, value in numbers.items():
             if self._prepared.get(name) != value:
                 self._set(name, value)
@@ -149,8 +158,9 @@ class Learner:
     def _set(self, name: str, value: float) -> None:
         if name in WEIGHTS:
             setattr(self.loss, name, value)
-        elif name == "kept":
-            self.targets.eps = recording.renewed(self.targets.eps, value)
+        elif name in ("target_critics", "target_actor"):
+            target = getattr(self, name)
+            target.eps = recording.renewed(target.eps, value)
         else:
             for optimizer in (*self.critic_optimizers, *self.actor_optimizers):
                 group = optimizer.param_groups[0]
@@ -183,11 +193,22 @@ class Learner:
 
     def step_targets(self) -> None:
         """Move the target networks towards the networks."""
-        self.targets.step()
+        self.target_critics.step()
+        self.target_actor.step()
 
-    def _early_rate(self, count: int) -> float:
-        """The least rate of the target networks after a number of their updates."""
-        return self.target_warmup / (self.target_warmup + count) if self.target_warmup else 0.0
+    def settle_actor(self) -> None:
+        """Put the target actor, a mean over the last updates, in the place of the actor.
+
+        Where two controls are worth nearly the same, the boundary between them swings from update to update. An actor
+        that is frozen at any one of them keeps a phase of that swing, and its mean lies in the middle.
+        """
+        self.loss.actor_network_params.data.update_(self.loss.target_actor_network_params.data)
+
+    def _target_rates(self, count: int) -> tuple[float, float]:
+        """The rates of the target critics and of the target actor after a number of their updates."""
+        early = self.target_warmup / (self.target_warmup + count) if self.target_warmup else 0.0
+        critics = max(self.polyak, early)
+        return critics, critics if self.actor_polyak is None else max(self.actor_polyak, 1 / (1 + count))
 
     def rate(self, decay: float) -> float:
         """The learning rate at a progress of its decay in [0, 1]."""

@@ -271,6 +271,8 @@ class Trainer:
 
     def _enter_stage(self) -> None:
         """Take over what the stage of the next update sets, and the run's own for the rest."""
+        if self.curriculum.freezes(self.update):
+            self.learner.settle_actor()
         settings = self._play(self.update)
         self.batches.collocation = settings.collocation
         self.learner.apply(settings)

@@ -179,28 +179,59 @@ def test_a_stage_that_cannot_be_followed_is_refused_at_the_start(stage, message,
         small_trainer(tmp_path, *POLICY, f"stages=[{{share: 1}}, {stage}]")
 
 
-def test_a_frozen_actor_stays_while_critics_and_targets_move(tmp_path):
+def test_a_frozen_actor_stays_while_the_critics_and_their_targets_move(tmp_path):
     trainer = small_trainer(tmp_path, "stages=[{share: 1}, {share: 1, train_actor: false}]", "trainer.updates=10")
     loss, half = trainer.learner.loss, {}
-    at_update(trainer, 6, lambda: half.update({name: entry.clone() for name, entry in loss.state_dict().items()}))
+    at_update(trainer, 7, lambda: half.update({name: entry.clone() for name, entry in loss.state_dict().items()}))
     trainer.train()
     for name, entry in loss.state_dict().items():
         if name.endswith("weight") and "network" in name:
-            frozen = name.startswith("actor")
+            frozen = name.startswith(("actor", "target_actor"))
             assert torch.equal(entry, half[name]) == frozen, name
+
+
+def test_an_actor_is_frozen_at_the_mean_of_its_parameters(tmp_path):
+    """Its updates j = 0, 1, ... have the weights that rates of at least 1/(1 + j) and of 0.3 give them."""
+    settings = ("stages=[{share: 2}, {share: 1, train_actor: false}]", "trainer.updates=18", "learner.actor_polyak=0.3")
+    trainer = small_trainer(tmp_path, *settings)
+    loss, step, seen = trainer.learner.loss, trainer.learner.step_targets, []
+
+    def noted():
+        seen.append(loss.actor_network_params.data.clone())
+        step()
+
+    trainer.learner.step_targets = noted
+    trainer.train()
+    mean = seen[0]
+    for j, actor in enumerate(seen[1:6], 1):
+        mean = mean.lerp(actor, torch.tensor(max(0.3, 1 / (1 + j))))
+    assert len(seen) == 9
+    for frozen in (seen[6], seen[8], loss.target_actor_network_params.data):
+        for name, entry in frozen.items(True, True):
+            torch.testing.assert_close(entry, mean[name], rtol=1e-5, atol=1e-7, msg=str(name))
+    moved = [not torch.equal(seen[5][name], entry) for name, entry in seen[6].items(True, True) if name[-1] == "weight"]
+    assert moved and all(moved)
+
+
+def test_only_an_actor_that_was_trained_comes_to_rest():
+    """One that a run has got from another run is a policy of which the value is learned: it stays what it is."""
+    stages = [Stage(train_actor=False), Stage(), Stage(train_actor=False), Stage(train_actor=False)]
+    curriculum = Curriculum(WHOLE, 8, stages)
+    assert [k for k in range(8) if curriculum.freezes(k)] == [4]
 
 
 def test_targets_follow_at_an_early_rate(tmp_path):
     """With a warm-up of 4 the rates are 4/4, 4/5, 4/6 and so on, but at least polyak."""
     trainer = small_trainer(tmp_path, "learner.target_warmup=4", "learner.polyak=0.45", "trainer.updates=16")
     learner, rates = trainer.learner, []
-    step = learner.targets.step
+    step = learner.step_targets
 
     def noted():
-        rates.append(1 - learner.targets.eps)
+        rates.append(1 - learner.target_critics.eps)
+        assert learner.target_actor.eps == learner.target_critics.eps
         step()
 
-    learner.targets.step = noted
+    learner.step_targets = noted
     trainer.train()
     assert rates == pytest.approx([1, 4 / 5, 4 / 6, 4 / 7, 4 / 8, 0.45, 0.45, 0.45])
 

@@ -559,13 +559,14 @@ def test_compiled_equals_eager_and_follows_the_weights():
 def test_targets_move_as_torchrl_s_updater_moves_them(problem):
     """Both updaters start with targets that equal the networks, which are changed before the step."""
     states = []
-    for updater in (SoftUpdate, FusedSoftUpdate):
+    for networks in ((), ("actor_network", "qvalue_network")):
         loss = make_loss(problem)
-        update = updater(loss, tau=0.3)
+        updates = [FusedSoftUpdate(loss, network, tau=0.3) for network in networks] or [SoftUpdate(loss, tau=0.3)]
         for params in (loss.actor_network_params, loss.qvalue_network_params):
             for key, entry in params.data.items(True, True):
                 _move(key, entry)
-        update.step()
+        for update in updates:
+            update.step()
         states.append(loss.state_dict())
     assert states[0].keys() == states[1].keys()
     assert all(torch.equal(entry, states[1][key]) for key, entry in states[0].items())
