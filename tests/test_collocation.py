@@ -9,7 +9,7 @@ from tensordict import TensorDict
 
 from pirl_rl.errors import ProblemError
 from pirl_rl.problems import HalfSpace, RadialExit, Reach1D, Safety1D, VehicleDrift
-from pirl_rl.sampling.boundary import BoundarySampler
+from pirl_rl.sampling.boundary import BoundarySampler, face_weights
 from pirl_rl.sampling.collocation import Collocation, ReplayCollocation
 from pirl_rl.sampling.faces import find_faces
 from pirl_rl.sets import Box
@@ -261,6 +261,31 @@ def test_a_set_that_is_not_found_is_named(problem):
         ProblemError, match=rf"{type(problem).__name__}: no point of the target was found, neither .* nor"
     ):
         BoundarySampler(problem).sample(make_rng())
+
+
+class Heading(Reach1D):
+    """A boat of the speed 1 in any direction beside a wall at x = 1: the best heading lies between both bounds."""
+
+    states, controls = Box([-1.0, -1.0], [1.0, 1.0]), Box([-torch.pi], [torch.pi])
+
+    def drift(self, x, u):
+        return -torch.stack([u[..., 0].cos(), u[..., 0].sin()], -1)
+
+    def diffusion(self, x, u):
+        return 0.1 * torch.eye(2).to(x).expand(*x.shape, 2)
+
+    def target_level(self, x):
+        return x[..., 0] + 0.9
+
+    def avoid_level(self, x):
+        return 0.9 - x[..., 0]
+
+
+def test_the_layer_at_a_face_is_that_of_the_best_heading():
+    """A boat leaves the wall at x = 0.9 with the speed 1 and the noise 0.1, so that the layer has the width 0.005."""
+    problem = Heading()
+    points, values = torch.tensor([[0.9, 0.0], [-0.9, 0.0]]), torch.tensor([0.0, 1.0])
+    torch.testing.assert_close(face_weights(problem, points, values), torch.tensor([0.005 / 0.05, 1.0]))
 
 
 class Discs(Reach1D):

@@ -22,6 +22,7 @@ from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.faces import FACE_POOL, Faces, find_faces
 from pirl_rl.sampling.initial_states import sample_interior
+from pirl_rl.switching import control_levels
 
 RESOLVED = 0.05
 """The width of the thinnest layer at a face in which data have their full weight, in half widths of the box."""
@@ -145,8 +146,8 @@ def face_weights(problem: ReachAvoidProblem, points: Tensor, values: Tensor) -> 
     """Weights (K,) in [0, 1] of boundary data: the width of the layer at the face in units of `RESOLVED`, at most 1.
 
     Speeds and widths are those along the normal of the face in coordinates in which the box of states is [-1, 1]^n. The
-    best control moves away from B, and towards A. One coordinate of it after the other is taken from its two bounds,
-    which is exact for a drift that is affine in u.
+    best control moves away from B, and towards A. One coordinate of it after the other is taken from its levels, see
+    `pirl_rl.switching.control_levels`. These are its two bounds, which is exact, where the Hamiltonian is affine in u.
 
     Args:
         problem: the physics and the sets.
@@ -161,10 +162,15 @@ def face_weights(problem: ReachAvoidProblem, points: Tensor, values: Tensor) -> 
         return (problem.drift(points, u) / half_width * normal).sum(-1)
 
     u = problem.controls.denormalize(points.new_zeros(len(points), problem.controls.dim))
+    levels = control_levels(problem) - 1
     for axis, (low, high) in enumerate(zip(problem.controls.low, problem.controls.high, strict=True)):
-        lower, upper = (u.index_fill(-1, torch.tensor(axis), bound) for bound in (low, high))
-        prefer_upper = (speed(upper) > speed(lower)) != on_target
-        u = torch.where(prefer_upper.unsqueeze(-1), upper, lower)
+        best = u.index_fill(-1, torch.tensor(axis), low)
+        for step in range(1, levels + 1):
+            level = high if step == levels else low + (high - low) * step / levels
+            other = u.index_fill(-1, torch.tensor(axis), level)
+            preferred = (speed(other) > speed(best)) != on_target
+            best = torch.where(preferred.unsqueeze(-1), other, best)
+        u = best
     across = (problem.diffusion(points, u) / half_width.unsqueeze(-1) * normal.unsqueeze(-1)).sum(-2)
     away = speed(u)
     layer = across.square().sum(-1) / (2 * away)
