@@ -17,11 +17,15 @@ from torch import Tensor
 
 from pirl_rl.arguments import Policy
 from pirl_rl.ascent import Objective, ascend
+from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
 TINY = torch.finfo(torch.float32).tiny
 """The smallest square of a slope that counts."""
+
+CHUNK_ENTRIES = 2**26
+"""The largest number of entries of sigma, over all points and actions, that are in memory at once."""
 
 Flow = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Maps states (N, n), controls (N, m) and lengths (N,), in s, to the states (N, n) after a step without noise."""
@@ -45,10 +49,20 @@ def hamiltonian(solution: Solution, tau: Tensor, x: Tensor, controlled_noise: bo
         along = (problem.drift(y, u) * slope).sum(-1)
         if curvature is None:
             return along
-        sigma = problem.diffusion(y, u)
-        return along + (sigma * (curvature @ sigma)).sum((-2, -1)) / 2
+        entries = problem.diffusion(y[..., :1, :], u[..., :1, :]).numel()
+        size = max(1, CHUNK_ENTRIES // max(1, entries))
+        if size >= len(x):
+            return along + _bend(problem, y, u, curvature)
+        parts = zip(y.split(size, -2), u.split(size, -2), curvature.split(size), strict=True)
+        return along + torch.cat([_bend(problem, *part) for part in parts], -1)
 
     return value
+
+
+def _bend(problem: ReachAvoidProblem, x: Tensor, u: Tensor, curvature: Tensor) -> Tensor:
+    """1/2 Tr(sigma sigma^T M) (*, N) at states (*, n) and controls (*, m), of M (N, n, n)."""
+    sigma = problem.diffusion(x, u)
+    return (sigma * (curvature @ sigma)).sum((-2, -1)) / 2
 
 
 def expected_ahead(solution: Solution, tau: Tensor, x: Tensor, length: float, channels: Sequence[int]) -> Objective:

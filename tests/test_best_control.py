@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from benchmarks.kinds import Bicycle, Gusty, Investor, Loiter, Sprint, TwoHarbours
-from pirl_rl import Box, ReachAvoidProblem
+from pirl_rl import Box, ReachAvoidProblem, action_values
 from pirl_rl.action_values import continued_value, expected_ahead, hamiltonian, value_ahead
 from pirl_rl.actor_rules import BestControl, Hamiltonian
 from pirl_rl.ascent import ascend, improved
@@ -105,6 +105,27 @@ class Quadratic:
 
     def gradient(self, tau: Tensor, x: Tensor) -> Tensor:
         return x @ self.M
+
+
+def test_a_hamiltonian_in_parts_is_the_whole(monkeypatch):
+    """Sigma (8, 50, n, w) of eight actions at each of 50 points has at most 400 entries at once, one point or a few."""
+    largest = []
+
+    class Counted(Steered):
+        def diffusion(self, x, u):
+            sigma = super().diffusion(x, u)
+            largest.append(sigma.numel())
+            return sigma
+
+    problem = Counted(controlled=True)
+    solution, (tau, x) = solution_of(problem), points(problem, 50)
+    action = 2 * torch.rand(8, 50, problem.controls.dim) - 1
+    whole = hamiltonian(solution, tau, x, True)(action)
+    monkeypatch.setattr(action_values, "CHUNK_ENTRIES", 400)
+    largest.clear()
+    parts = hamiltonian(solution, tau, x, True)(action)
+    torch.testing.assert_close(parts, whole)
+    assert max(largest) <= 400
 
 
 def test_the_cubature_is_exact_for_a_quadratic_value():
