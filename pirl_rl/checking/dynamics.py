@@ -30,8 +30,11 @@ COVERS = 0.9
 PART = 0.38
 """A shift by this share of its period changes a function that repeats."""
 
-THIN = 2.0
-"""Moves in one integration step, in depths of a set, from which paths jump over the set."""
+THIN = 1.0
+"""A move in one integration step, in depths of a set, from which paths jump over the set.
+
+Of Brownian paths that meet a wall, the simulator lets 0.15 % pass at this ratio, and 2.9 % at twice the ratio.
+"""
 
 COARSE = 0.1
 """The distance of two numbers in single precision, in the largest move of an integration step, that is too large."""
