@@ -27,6 +27,7 @@ VARIANTS: dict[str, list[str]] = {
     "ascent of the Hamiltonian": ["pirl.actor_rule={_target_:pirl_rl.actor_rules.Hamiltonian}"],
     "no last stage": ["pirl.stages=[]"],
     "returns of 40 steps": ["pirl.n_steps=40"],
+    "last actor": ["learner.actor_polyak=1"],
     "Adam": ["learner.optimizer=adam"],
     "1024 paths": ["env.num_envs=1024"],
     "half of the transitions": ["collector.updates_per_batch=100"],
