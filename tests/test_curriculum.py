@@ -210,7 +210,8 @@ def test_an_actor_is_frozen_at_the_mean_of_its_parameters(tmp_path):
         for name, entry in frozen.items(True, True):
             torch.testing.assert_close(entry, mean[name], rtol=1e-5, atol=1e-7, msg=str(name))
     moved = [not torch.equal(seen[5][name], entry) for name, entry in seen[6].items(True, True) if name[-1] == "weight"]
-    assert moved and all(moved)
+    assert moved
+    assert all(moved)
 
 
 def test_only_an_actor_that_was_trained_comes_to_rest():

@@ -162,15 +162,13 @@ def face_weights(problem: ReachAvoidProblem, points: Tensor, values: Tensor) -> 
         return (problem.drift(points, u) / half_width * normal).sum(-1)
 
     u = problem.controls.denormalize(points.new_zeros(len(points), problem.controls.dim))
-    levels = control_levels(problem) - 1
+    count = control_levels(problem)
     for axis, (low, high) in enumerate(zip(problem.controls.low, problem.controls.high, strict=True)):
-        best = u.index_fill(-1, torch.tensor(axis), low)
-        for step in range(1, levels + 1):
-            level = high if step == levels else low + (high - low) * step / levels
-            other = u.index_fill(-1, torch.tensor(axis), level)
-            preferred = (speed(other) > speed(best)) != on_target
-            best = torch.where(preferred.unsqueeze(-1), other, best)
-        u = best
+        levels = torch.linspace(low, high, count, dtype=torch.float64).tolist()
+        u, *others = (u.index_fill(-1, torch.tensor(axis), level) for level in levels)
+        for other in others:
+            preferred = (speed(other) > speed(u)) != on_target
+            u = torch.where(preferred.unsqueeze(-1), other, u)
     across = (problem.diffusion(points, u) / half_width.unsqueeze(-1) * normal.unsqueeze(-1)).sum(-2)
     away = speed(u)
     layer = across.square().sum(-1) / (2 * away)
