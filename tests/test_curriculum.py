@@ -223,7 +223,8 @@ def test_only_an_actor_that_was_trained_comes_to_rest():
 
 def test_targets_follow_at_an_early_rate(tmp_path):
     """With a warm-up of 4 the rates are 4/4, 4/5, 4/6 and so on, but at least polyak."""
-    trainer = small_trainer(tmp_path, "learner.target_warmup=4", "learner.polyak=0.45", "trainer.updates=16")
+    rates_of_targets = "learner.target_warmup=4", "learner.polyak=0.45", "learner.actor_polyak=null"
+    trainer = small_trainer(tmp_path, *rates_of_targets, "trainer.updates=16")
     learner, rates = trainer.learner, []
     step = learner.step_targets
 
