@@ -80,7 +80,7 @@ class Learner:
             raise ArgumentError(f"learner.actor_polyak: expected a number in (0, 1], got {actor_polyak}")
         self.polyak, self.target_warmup, self.actor_polyak = polyak, target_warmup, actor_polyak
         self.target_critics = FusedSoftUpdate(loss, "qvalue_network", polyak)
-        self.target_actor = FusedSoftUpdate(loss, "actor_network", actor_polyak or polyak)
+        self.target_actor = FusedSoftUpdate(loss, "actor_network", polyak)
         device, rate = loss.td_weight.device, learning_rate
         self._largest: Tensor | None = None
         if recording.records(device):

@@ -171,6 +171,7 @@ COMMANDS = {
     "negative updates": (train, (*SMALL, "trainer.updates=-5"), "trainer.updates: expected an integer >= 1, got -5"),
     "updates of text": (train, (*SMALL, "trainer.updates=many"), "trainer.updates: expected int, got 'many'"),
     "negative rate": (train, (*SMALL, "learner.learning_rate=-1"), "learner: expected learning_rate > 0"),
+    "target actor at rest": (train, (*SMALL, "learner.actor_polyak=0"), "actor_polyak: expected a number in"),
     "rate that diverges": (train, (*SMALL, "learner.learning_rate=1e6"), "td_loss is not finite or above"),
     "no time step": (train, (*SMALL, "env.dt=0"), "env.dt: expected 0 < dt <= horizon"),
     "time step of text": (train, (*SMALL, "env.dt=soon"), "env.dt: expected float, got 'soon'"),
