@@ -199,8 +199,8 @@ class Learner:
     def settle_actor(self) -> None:
         """Put the target actor, a mean over the last updates, in the place of the actor.
 
-        Where two controls are worth nearly the same, the boundary between them swings from update to update. An actor
-        that is frozen at any one of them keeps a phase of that swing, and its mean lies in the middle.
+        Where two controls are worth nearly the same, the surface at which the policy changes from one to the other
+        moves to and fro from update to update. The last actor may have it at either end, and the mean in the middle.
         """
         self.loss.actor_network_params.data.update_(self.loss.target_actor_network_params.data)
 

@@ -264,7 +264,7 @@ def test_a_set_that_is_not_found_is_named(problem):
 
 
 class Heading(Reach1D):
-    """A boat of the speed 1 in any direction beside a wall at x = 1: the best heading lies between both bounds."""
+    """A boat of the speed 1 in any direction beside a wall at x = 0.9: the best heading lies between both bounds."""
 
     states, controls = Box([-1.0, -1.0], [1.0, 1.0]), Box([-torch.pi], [torch.pi])
 
