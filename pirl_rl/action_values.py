@@ -65,7 +65,39 @@ def _bend(problem: ReachAvoidProblem, x: Tensor, u: Tensor, curvature: Tensor) -
     return (sigma * (curvature @ sigma)).sum((-2, -1)) / 2
 
 
-def expected_ahead(solution: Solution, tau: Tensor, x: Tensor, length: float, channels: Sequence[int]) -> Objective:
+def free_step(
+    problem: ReachAvoidProblem, x: Tensor, channels: Sequence[int], shortest: float, longest: float
+) -> Tensor:
+    """The length (N,) in s, between two bounds, of an Euler step whose noise goes at most half way to A and to B.
+
+    The ends of the cubature of `expected_ahead` are at +- sqrt(w h) sigma_k. With s = |sigma^T grad g| for the level g
+    of a set, they move g by at most s sqrt(w h), so that h = g^2 / (4 w s^2). The noise is that of two opposite corners
+    of the box of controls, whichever is stronger.
+
+    Args:
+        problem: the physics.
+        x: states (N, n).
+        channels: the w columns of sigma that count, at least one.
+        shortest, longest: the bounds of the length, in s.
+    """
+    corners = torch.tensor([-1.0, 1.0], dtype=x.dtype, device=x.device).view(2, 1, 1)
+    u = problem.controls.denormalize(corners.expand(2, len(x), problem.controls.dim))
+    sigma = problem.diffusion(x.expand(2, -1, -1), u)[..., list(channels)]
+    levels: list[Callable[[Tensor], Tensor]] = [problem.scaled_avoid_level] if problem.has_avoid_set else []
+    if problem.objective == "reach-avoid":
+        levels.append(lambda y: problem.scaled_reached_constraints(y).amax(-1))
+    length = torch.full_like(x[:, 0], longest)
+    for level in levels:
+        slope = torch.func.grad(lambda y, level=level: level(y).sum())(x)
+        spread = (slope.unsqueeze(-1) * sigma).sum(-2).square().sum(-1).amax(0)
+        free = level(x).square() / (4 * len(channels) * spread).clamp(min=TINY)
+        length = torch.minimum(length, free.nan_to_num(0.0))  # a level without a number may be that of a near face
+    return length.clamp(min=shortest)
+
+
+def expected_ahead(
+    solution: Solution, tau: Tensor, x: Tensor, length: float | Tensor, channels: Sequence[int]
+) -> Objective:
     """E V (*, N) after one Euler step with the action (*, N, m), by a cubature of degree three, Eq. (cubature).
 
     The mean over y = x + f h +- sqrt(w h) sigma_k, for w columns of sigma, has the mean and the covariance of the step.
@@ -76,7 +108,7 @@ def expected_ahead(solution: Solution, tau: Tensor, x: Tensor, length: float, ch
         solution: gives V, with its values in A and B, and the problem.
         tau: times to go (N,), in s.
         x: states (N, n).
-        length: h in s; it is shortened to tau.
+        length: h in s, one number or those of all states (N,); it is shortened to tau.
         channels: the w columns of sigma that count, at least one. The effect of a column that does not depend on the
             action adds the same to all actions, to first order in h, and may be left out.
     """

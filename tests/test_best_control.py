@@ -12,7 +12,7 @@ from torch import Tensor
 
 from benchmarks.kinds import Bicycle, Gusty, Investor, Loiter, Sprint, TwoHarbours
 from pirl_rl import Box, ReachAvoidProblem, action_values
-from pirl_rl.action_values import continued_value, expected_ahead, hamiltonian, value_ahead
+from pirl_rl.action_values import continued_value, expected_ahead, free_step, hamiltonian, value_ahead
 from pirl_rl.actor_rules import BestControl, Hamiltonian
 from pirl_rl.ascent import ascend, improved
 from pirl_rl.assembly import make_trainer
@@ -243,6 +243,45 @@ def test_noise_beside_a_face_is_not_preferred():
     objective = expected_ahead(Straight(), torch.ones(5), x, 0.05, [0, 1])  # type: ignore[arg-type]
     still, noisy = (objective(torch.full((5, 1), action)) for action in (-1.0, 1.0))
     assert torch.allclose(still, noisy, atol=1e-6)
+
+
+def test_a_free_step_goes_half_way_to_the_faces():
+    """Two channels of strength 1, which h moves by sqrt(2 h), and levels of any slope; see `free_step`."""
+    x = Channel().states.sample(200, torch.Generator().manual_seed(3))
+    distance = 1 - x[:, 0].abs()
+    found = free_step(Channel(), x, [0, 1], 1e-3, 0.05)
+    torch.testing.assert_close((2 * found).sqrt(), (distance / 2).clamp((2e-3) ** 0.5, 0.1**0.5))
+    assert {1e-3, 0.05} <= {round(length, 6) for length in found.tolist()}
+    torch.testing.assert_close(free_step(Channel(), x, [0], 1e-3, 10.0), (distance / 2).square().clamp(min=1e-3))
+    assert torch.equal(free_step(Channel(), x, [0, 1], 0.05, 0.05), torch.full((200,), 0.05))
+
+
+def test_a_level_without_a_number_leaves_the_shortest_step():
+    class Torn(Channel):
+        def avoid_level(self, x: Tensor) -> Tensor:
+            return torch.where(x[..., 1] > 0.5, torch.nan, super().avoid_level(x))
+
+    x = torch.tensor([[0.0, 0.6], [0.0, 0.4]])
+    assert free_step(Torn(), x, [0, 1], 1e-3, 0.05).tolist() == pytest.approx([1e-3, 0.05])
+
+
+class Rippled:
+    """V = 1/2 - x_1^2/10 with a ripple, whose second derivative has the wrong sign at every other crest."""
+
+    problem = Channel()
+
+    def value(self, tau: Tensor, x: Tensor) -> Tensor:
+        return 0.5 - 0.1 * x[..., 0].square() + 4e-5 * torch.cos(100 * x[..., 0])
+
+
+def test_a_ripple_of_the_value_does_not_decide_on_the_noise(monkeypatch):
+    """V is concave, so that no noise is best; in the troughs of its ripple one control step shows the opposite."""
+    x = torch.stack([torch.tensor([-3.0, -1.0, 1.0, 3.0]) * math.pi / 100, torch.zeros(4)], -1)
+    rule = BestControl(Channel(), Simulator(Channel(), 1e-4), levels=5)
+    levels, args = torch.linspace(-1, 1, 5).unsqueeze(-1), (Rippled(), torch.full((4,), 0.5), x, torch.zeros(4, 1))
+    assert rule._improved(*args, levels, 0.0)[0].tolist() == [[-1.0]] * 4  # type: ignore[arg-type]
+    monkeypatch.setattr("pirl_rl.actor_rules.best_control.AHEAD", 0.0)
+    assert rule._improved(*args, levels, 0.0)[0].tolist() == [[1.0]] * 4  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("critics", [1, 2])

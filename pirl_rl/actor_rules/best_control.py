@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from pirl_rl.action_values import Flow, expected_ahead, hamiltonian, value_ahead
+from pirl_rl.action_values import Flow, expected_ahead, free_step, hamiltonian, value_ahead
 from pirl_rl.actor_rules.base import ActorRule
 from pirl_rl.ascent import Objective, improved
 from pirl_rl.errors import ArgumentError
@@ -38,6 +38,9 @@ STRIDE = 4
 All of them count for the budget.
 """
 
+AHEAD = 0.01
+"""The length of the step of a cubature away from faces, as a share of the horizon, if a control step is not longer."""
+
 MOST_PAIRS = 64
 """The largest number of noise channels times controls for which the noise of a step is simulated."""
 
@@ -56,11 +59,13 @@ class BestControl(ActorRule):
     cross-entropy of its scores, -log softmax(scores)_j for the best level j. Where it chooses several coordinates
     together, j is the best of all combinations of their levels, and w_i the range of the Hamiltonian over these.
 
-    For the coordinates of u on which sigma depends, E V after one control step takes the place of the Hamiltonian,
-    divided by dt, see `pirl_rl.action_values.expected_ahead`: next to faces the Hessian of a network may have the
-    wrong sign. The step has the noise of those channels that depend on the coordinate. Coordinates on which the same
-    channels depend take their best levels at once, one block of them after the other. With more noise channels times
-    controls than `MOST_PAIRS` the step would be too dear, and the Hamiltonian stays.
+    For the coordinates of u on which sigma depends, E V after one step takes the place of the Hamiltonian, divided by
+    the length of the step, see `pirl_rl.action_values.expected_ahead`: next to faces the Hessian of a network may have
+    the wrong sign. Away from faces the step takes `AHEAD` of the horizon, because the second derivatives of a network
+    have ripples, over which a longer step takes the mean. Next to faces it is as short as a control step, see
+    `pirl_rl.action_values.free_step`. The step has the noise of those channels that depend on the coordinate.
+    Coordinates on which the same channels depend take their best levels at once, one block of them after the other.
+    With more noise channels times controls than `MOST_PAIRS` the step would be too dear, and the Hamiltonian stays.
 
     The Hamiltonian is the limit of a control that is never held. Where a control step is long, as with fewer than a
     hundred of them in the horizon, V after `steps` noise-free control steps takes its place, divided by dt: the first
@@ -176,13 +181,14 @@ class BestControl(ActorRule):
 
     def _objective(
         self, solution: Solution, tau: Tensor, x: Tensor, channels: tuple[int, ...]
-    ) -> tuple[Objective, float]:
-        """What is maximised, and its unit in s."""
+    ) -> tuple[Objective, float | Tensor]:
+        """What is maximised, and its unit in s, one number or those of all points (N, 1)."""
         dt = self.simulator.dt
         if self.steps:
             return value_ahead(solution, self.simulator, tau, x, self.steps, self.flow), dt
         if channels:
-            return expected_ahead(solution, tau, x, dt, channels), dt
+            length = free_step(solution.problem, x, channels, dt, max(dt, AHEAD * solution.problem.horizon))
+            return expected_ahead(solution, tau, x, length, channels), length.unsqueeze(-1)
         return hamiltonian(solution, tau, x, self.controlled_noise and not self.cubature), 1.0
 
     def check(self, critic: Critic, exploration_noise: float | None = None) -> None:
