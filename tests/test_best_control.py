@@ -274,14 +274,13 @@ class Rippled:
         return 0.5 - 0.1 * x[..., 0].square() + 4e-5 * torch.cos(100 * x[..., 0])
 
 
-def test_a_ripple_of_the_value_does_not_decide_on_the_noise(monkeypatch):
+def test_a_ripple_of_the_value_does_not_decide_on_the_noise():
     """V is concave, so that no noise is best; in the troughs of its ripple one control step shows the opposite."""
     x = torch.stack([torch.tensor([-3.0, -1.0, 1.0, 3.0]) * math.pi / 100, torch.zeros(4)], -1)
-    rule = BestControl(Channel(), Simulator(Channel(), 1e-4), levels=5)
     levels, args = torch.linspace(-1, 1, 5).unsqueeze(-1), (Rippled(), torch.full((4,), 0.5), x, torch.zeros(4, 1))
-    assert rule._improved(*args, levels, 0.0)[0].tolist() == [[-1.0]] * 4  # type: ignore[arg-type]
-    monkeypatch.setattr("pirl_rl.actor_rules.best_control.AHEAD", 0.0)
-    assert rule._improved(*args, levels, 0.0)[0].tolist() == [[1.0]] * 4  # type: ignore[arg-type]
+    for ahead, best in ((0.01, -1.0), (0.0, 1.0)):
+        rule = BestControl(Channel(), Simulator(Channel(), 1e-4), levels=5, ahead=ahead)
+        assert rule._improved(*args, levels, 0.0)[0].tolist() == [[best]] * 4  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("critics", [1, 2])
@@ -657,12 +656,14 @@ def test_masked_points_do_not_count():
 
 def test_what_the_rule_refuses():
     with pytest.raises(
-        ArgumentError, match=r"steps >= 0, levels >= 2, budget >= 1 and inertia >= 0, got 0, 1, 8192 and None"
+        ArgumentError, match=r"levels >= 2, budget >= 1, inertia >= 0 and ahead >= 0, got 0, 1, 8192, None and 0.01"
     ):
         BestControl(Reach1D(), Simulator(Reach1D(), 0.1), levels=1)
-    with pytest.raises(ArgumentError, match=r"budget >= 1 and inertia >= 0, got 0, 2, 0 and None"):
+    with pytest.raises(ArgumentError, match=r"budget >= 1, inertia >= 0 and ahead >= 0, got 0, 2, 0, None and 0.01"):
         BestControl(Reach1D(), Simulator(Reach1D(), 0.1), budget=0)
-    with pytest.raises(ArgumentError, match=r"inertia >= 0, got 0, 2, 8192 and -0\.1"):
+    with pytest.raises(ArgumentError, match=r"ahead >= 0, got 0, 2, 8192, None and -1"):
+        BestControl(Reach1D(), Simulator(Reach1D(), 0.1), ahead=-1)
+    with pytest.raises(ArgumentError, match=r"inertia >= 0 and ahead >= 0, got 0, 2, 8192, -0\.1 and 0.01"):
         BestControl(Reach1D(), Simulator(Reach1D(), 0.1), inertia=-0.1)
     with pytest.raises(ArgumentError, match=r"expected critic\.action_input=false"):
         BestControl(Reach1D(), Simulator(Reach1D(), 0.1)).check(Critic(Reach1D(), action_input=True))

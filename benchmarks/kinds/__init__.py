@@ -1,7 +1,7 @@
 """Problems of other kinds than those of the suite, each written as a user would write it."""
 
 from benchmarks.kinds.approaches import Chain, Pursuit, Rendezvous, Unicycle
-from benchmarks.kinds.compartments import Anaesthesia, LotkaVolterra, LynxAndHare, Rooms
+from benchmarks.kinds.compartments import Anaesthesia, HerdImmunity, LotkaVolterra, LynxAndHare, Rooms
 from benchmarks.kinds.cycles import JetLag, PowerSwing, Runaway, Searchlight
 from benchmarks.kinds.demands import Backburn, ChemoWard, IslandGrid, VaccineStock
 from benchmarks.kinds.masses import Crosswind, Gusty, Lander, Orbit, Servo, Sprint, VanDerPol
@@ -20,6 +20,6 @@ KINDS += (VanDerPol, TwoHarbours, River, Loiter, Crosswind, Bicycle, Tokens, Lan
 KINDS += (Investor, Runaway, JetLag, Searchlight, PowerSwing, Forager, Ferment, FastCharge, SlotChange, TwoLink)
 KINDS += (Bearing, Mirror, Duffing, MountainCar, Swingup, Pursuit, Rooms, Anaesthesia)
 KINDS += (LotkaVolterra, Chain, Unicycle, Rendezvous, FastRiver, Glider, Reactor, Fishery)
-KINDS += (VaccineStock, Backburn, ChemoWard, IslandGrid, StraitFerry, QuietStance, LynxAndHare)
+KINDS += (VaccineStock, Backburn, ChemoWard, IslandGrid, StraitFerry, QuietStance, LynxAndHare, HerdImmunity)
 
 PROBLEMS = {kind.__name__: kind for kind in KINDS}

@@ -100,3 +100,33 @@ class LynxAndHare(ReachAvoidProblem):
     def avoid_constraints(self, x: Tensor) -> Tensor:
         hares, lynx = x.unbind(-1)
         return rows((hares - 30.0) / 230.0, (260.0 - hares) / 230.0, (lynx - 5.0) / 27.0, (32.0 - lynx) / 27.0)
+
+
+class HerdImmunity(ReachAvoidProblem):
+    """End an epidemic at 30 % susceptible before more than 5 % are infected at once; in percent and days.
+
+    The controls are the share of contacts that is avoided and the rate of vaccination. Infections in clusters make
+    noise that grows with the contacts.
+    """
+
+    horizon = 100.0
+    states, controls = Box([30.0, 0.05], [85.0, 5.0]), Box([0.0, 0.0], [0.8, 0.005])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        contacts = self._contacts(x, u)
+        vaccinated, recovered = u[..., 1] * x[..., 0], 0.1 * x[..., 1]
+        return rows(-0.35 * contacts - vaccinated, 0.35 * contacts - recovered)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        clusters = 0.9 * self._contacts(x, u)
+        return rows(-clusters, clusters).unsqueeze(-1)
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return rows((x[..., 0] - 30) / 55, (x[..., 1] - 5) / 5)
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        return (5 - x[..., 1]) / 5
+
+    @staticmethod
+    def _contacts(x: Tensor, u: Tensor) -> Tensor:
+        return (1 - u[..., 0]) * x[..., 0] * x[..., 1] / 100

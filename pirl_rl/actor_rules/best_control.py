@@ -38,9 +38,6 @@ STRIDE = 4
 All of them count for the budget.
 """
 
-AHEAD = 0.01
-"""The length of the step of a cubature away from faces, as a share of the horizon, if a control step is not longer."""
-
 MOST_PAIRS = 64
 """The largest number of noise channels times controls for which the noise of a step is simulated."""
 
@@ -61,7 +58,7 @@ class BestControl(ActorRule):
 
     For the coordinates of u on which sigma depends, E V after one step takes the place of the Hamiltonian, divided by
     the length of the step, see `pirl_rl.action_values.expected_ahead`: next to faces the Hessian of a network may have
-    the wrong sign. Away from faces the step takes `AHEAD` of the horizon, because the second derivatives of a network
+    the wrong sign. Away from faces the step is longer than a control step, because the second derivatives of a network
     have ripples, over which a longer step takes the mean. Next to faces it is as short as a control step, see
     `pirl_rl.action_values.free_step`. The step has the noise of those channels that depend on the coordinate.
     Coordinates on which the same channels depend take their best levels at once, one block of them after the other.
@@ -93,9 +90,11 @@ class BestControl(ActorRule):
             better bound changes with each small change of V, and an actor that follows comes to rest between both.
             None takes `CHOICE_INERTIA` for an actor that chooses among numbers, if sigma does not depend on u, and
             else `INERTIA`.
+        ahead: the length of the step of a cubature away from faces, as a share of the horizon, >= 0. The step is never
+            shorter than a control step, so that 0 takes one control step everywhere.
 
     Raises:
-        ArgumentError: `steps` or `inertia` is below 0, `levels` below 2, or `budget` below 1.
+        ArgumentError: `steps`, `inertia` or `ahead` is below 0, `levels` below 2, or `budget` below 1.
     """
 
     trains_choices = True
@@ -108,17 +107,18 @@ class BestControl(ActorRule):
         levels: int | None = None,
         budget: int = 8_192,
         inertia: float | None = None,
+        ahead: float = 0.01,
     ):
         if levels is None:
             levels = max(LEVELS if steps else 2, control_levels(problem))
-        if steps < 0 or levels < 2 or budget < 1 or (inertia is not None and inertia < 0):
+        if steps < 0 or levels < 2 or budget < 1 or (inertia is not None and inertia < 0) or not ahead >= 0:
             raise ArgumentError(
-                "actor_rule: expected steps >= 0, levels >= 2, budget >= 1 and inertia >= 0, "
-                f"got {steps}, {levels}, {budget} and {inertia}"
+                "actor_rule: expected steps >= 0, levels >= 2, budget >= 1, inertia >= 0 and ahead >= 0, "
+                f"got {steps}, {levels}, {budget}, {inertia} and {ahead}"
             )
         self.simulator, self.steps, self.levels, self.inertia = simulator, steps, levels, inertia
         self.controlled_noise, self.compiles_whole = simulator.controlled_noise, steps == 0
-        m, self.budget = problem.controls.dim, budget
+        m, self.budget, self.longest = problem.controls.dim, budget, max(simulator.dt, ahead * problem.horizon)
         self.cubature = steps == 0 and self.controlled_noise and noise_channels(problem) * m <= MOST_PAIRS
         self.channels = controlled_channels(problem) if self.cubature else [[]] * m
         self.flow: Flow = simulator.flow
@@ -187,7 +187,7 @@ class BestControl(ActorRule):
         if self.steps:
             return value_ahead(solution, self.simulator, tau, x, self.steps, self.flow), dt
         if channels:
-            length = free_step(solution.problem, x, channels, dt, max(dt, AHEAD * solution.problem.horizon))
+            length = free_step(solution.problem, x, channels, dt, self.longest)
             return expected_ahead(solution, tau, x, length, channels), length.unsqueeze(-1)
         return hamiltonian(solution, tau, x, self.controlled_noise and not self.cubature), 1.0
 
