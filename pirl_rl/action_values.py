@@ -71,8 +71,8 @@ def free_step(
     """The length (N,) in s, between two bounds, of an Euler step whose noise goes at most half way to A and to B.
 
     The ends of the cubature of `expected_ahead` are at +- sqrt(w h) sigma_k. With s = |sigma^T grad g| for the level g
-    of a set, they move g by at most s sqrt(w h), so that h = g^2 / (4 w s^2). The noise is that of two opposite corners
-    of the box of controls, whichever is stronger.
+    of a set, they move g by at most s sqrt(w h) to first order, so that h = g^2 / (4 w s^2). The noise is that of two
+    opposite corners of the box of controls, whichever is stronger.
 
     Args:
         problem: the physics.
@@ -83,9 +83,9 @@ def free_step(
     corners = torch.tensor([-1.0, 1.0], dtype=x.dtype, device=x.device).view(2, 1, 1)
     u = problem.controls.denormalize(corners.expand(2, len(x), problem.controls.dim))
     sigma = problem.diffusion(x.expand(2, -1, -1), u)[..., list(channels)]
-    levels: list[Callable[[Tensor], Tensor]] = [problem.scaled_avoid_level] if problem.has_avoid_set else []
+    levels = [problem.scaled_avoid_level] if problem.has_avoid_set else []
     if problem.objective == "reach-avoid":
-        levels.append(lambda y: problem.scaled_reached_constraints(y).amax(-1))
+        levels.append(problem.scaled_reached_level)
     length = torch.full_like(x[:, 0], longest)
     for level in levels:
         slope = torch.func.grad(lambda y, level=level: level(y).sum())(x)
@@ -144,8 +144,7 @@ def continued_value(solution: Solution, tau: Tensor, x: Tensor) -> Tensor:
     if problem.has_avoid_set:
         y = torch.where(failed.unsqueeze(-1), _mirrored(problem.scaled_avoid_level, x), y)
     if problem.objective == "reach-avoid":
-        mirrored = _mirrored(lambda z: problem.scaled_reached_constraints(z).amax(-1), x)
-        y = torch.where(reached.unsqueeze(-1), mirrored, y)
+        y = torch.where(reached.unsqueeze(-1), _mirrored(problem.scaled_reached_level, x), y)
     # Networks take one axis of points: stacked critics have an axis of their own before it.
     value = solution.value(tau.flatten(), y.flatten(0, -2)).reshape(tau.shape)
     return torch.where(reached, 2 - value, torch.where(failed, -value, value))

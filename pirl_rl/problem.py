@@ -192,6 +192,10 @@ class ReachAvoidProblem(ABC):
         """
         return _divided(self.reached_constraints(x), self._reached_units)
 
+    def scaled_reached_level(self, x: Tensor) -> Tensor:
+        """The level (*) of the set that absorbs with success, in the same units."""
+        return self.scaled_reached_constraints(x).amax(-1)
+
     def scaled_avoid_constraints(self, x: Tensor) -> Tensor:
         """`avoid_constraints` (*, k), each divided by a power of two, see `scaled_reached_constraints`."""
         return _divided(self.avoid_constraints(x), self._avoid_units)

@@ -266,7 +266,7 @@ def test_a_level_without_a_number_leaves_the_shortest_step():
 
 
 class Rippled:
-    """V = 1/2 - x_1^2/10 with a ripple, whose second derivative has the wrong sign at every other crest."""
+    """V = 1/2 - x_1^2/10 with a ripple, in whose troughs V has a positive second derivative along x_1."""
 
     problem = Channel()
 

@@ -132,7 +132,7 @@ def _level(problem: ReachAvoidProblem, what: str) -> Callable[[Tensor], Tensor]:
     """The level (*) of a set, at states (*, n); that of a smoothed payoff for the target."""
     if what == "avoid set":
         return problem.scaled_avoid_level
-    return lambda x: problem.scaled_reached_constraints(x).amax(-1)
+    return problem.scaled_reached_level
 
 
 def _sets(samples: Samples):

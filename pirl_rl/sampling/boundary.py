@@ -181,5 +181,5 @@ def _outward(problem: ReachAvoidProblem, points: Tensor, values: Tensor) -> Tens
     with torch.enable_grad():
         level = problem.scaled_avoid_constraints(x).amin(-1)
         if problem.objective == "reach-avoid":
-            level = torch.where(values > 0.5, problem.scaled_reached_constraints(x).amax(-1), level)
+            level = torch.where(values > 0.5, problem.scaled_reached_level(x), level)
         return torch.autograd.grad(level.sum(), x)[0]
