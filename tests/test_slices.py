@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.image import imread
+from matplotlib.quiver import Quiver
 
 from pirl_rl.evaluation import Rollouts, Slices, evaluate
 from pirl_rl.evaluation.slices import Section, projected_field
@@ -189,6 +190,18 @@ def test_evidence_is_among_the_figures_of_a_run(tmp_path):
     paths = draw_run(solution, tmp_path / "none.csv", tmp_path / "figures", evidence)
     assert [path.name for path in paths] == ["slice_walk_angle.png", "policy_walk_angle.png", "rollouts.png"]
     assert all(imread(path)[..., :3].std() > 0.01 for path in paths)
+
+
+def test_arrows_are_drawn_outside_the_sets_alone():
+    solution = Known(Walk())
+    simulator = Simulator(solution.problem, dt=0.1, substeps=10, crossing="endpoint")
+    evidence = evaluate(solution, simulator, {"slices": Slices(11, 2)})
+    left = draw(evidence["slices"])["slice_walk_angle"].axes[0]
+    (arrows,) = [artist for artist in left.collections if isinstance(artist, Quiver)]
+    shown = ~arrows.Umask
+    assert (shown == (arrows.X < 2)).all()
+    assert shown.any()
+    assert not shown.all()
 
 
 def test_every_metric_of_the_drifting_problem_has_a_meaning():

@@ -220,7 +220,16 @@ def test_alternatives_stand_in_the_table_and_are_kept(tmp_path, capsys, monkeypa
 
 def test_a_figure_of_problems_without_a_truth():
     score = Score(*[math.nan] * 3, 0.5, math.nan, 0.01, math.nan, 0.02, 0.01, 60.0, 12_000)
-    assert len(draw_suite({"cartpole": [asdict(score)]}).axes) == 4
+    assert len(draw_suite({"cartpole": [asdict(score)]}).axes) == 3
+
+
+def test_a_figure_has_times_of_problems_that_come_in_several_dimensions():
+    score = Score(1e-4, 0.01, 0.1, 0.5, 0.002, 0.001, 0.02, 0.01, 0.009, 60.0, 12_000)
+    figure = draw_suite({f"halfspace-{n}": [asdict(score), asdict(score) | {"seconds": 50.0 + n}] for n in (2, 8)})
+    gap, times = figure.axes[2:]
+    assert times.lines[0].get_xdata().tolist() == [2, 8]
+    assert list(times.lines[0].get_ydata()) == [52.0, 58.0]
+    assert [0.009, 0.009] in [list(line.get_xdata()) for line in gap.lines]
 
 
 def test_files_in_the_place_of_a_run_stay(tmp_path, capsys):

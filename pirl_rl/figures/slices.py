@@ -66,8 +66,12 @@ def _draw_field(axes: Axes, section: Section, field: np.ndarray) -> None:
     """Draw the directions of the vector field as arrows of equal length, with both axes scaled by the box."""
     half = (np.array(section.plane.box.high) - np.array(section.plane.box.low)) / 2
     length = np.linalg.norm(field / half, axis=-1, keepdims=True)
-    # A point that stands still in the plane, such as a position at rest, has no arrow.
-    arrows = np.where(length > 0, field / np.where(length > 0, length, 1), np.nan)
+    # A point that stands still in the plane, such as a position at rest, has no arrow, nor has one in A or B, where
+    # paths have ended.
+    ended = (section.reached | section.failed).numpy()
+    nearest = np.linspace(0, len(ended) - 1, len(field)).round().astype(int)
+    moves = (length > 0) & ~ended[np.ix_(nearest, nearest)][..., None]
+    arrows = np.where(moves, field / np.where(moves, length, 1), np.nan)
     first, second = (axis.numpy() for axis in section.axes)
     every = slice(None, None, -(-len(first) // ARROWS))
     shown = arrows[every, every]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -15,27 +16,42 @@ PANELS = {
 }
 """The measured quantities that are drawn by problem, with their labels."""
 
+ERROR: dict[str, Any] = {"fmt": "none", "ecolor": "C0", "elinewidth": 0.8, "alpha": 0.5}
+"""The style of the bars of standard errors."""
+
 FAMILY = re.compile(r"(\w+)-(\d+)")
 """The name of a problem that comes in several dimensions, such as halfspace-32."""
 
 
 def draw_suite(scores: Mapping[str, Sequence[Mapping[str, float]]]) -> Figure:
-    """Dots for all seeds of each problem.
+    """Dots for all seeds of each problem, with the standard error of the loss and the noise in the distance.
+
+    The last panel has the time of training of problems that come in several dimensions; without any it is left out.
 
     Args:
         scores: the entries of the scores of all seeds, by the name of the problem.
     """
-    figure = Figure(figsize=(14, 1.8 + 0.3 * len(scores)), layout="constrained")
-    panels = figure.subplots(1, len(PANELS) + 1, width_ratios=[1] * len(PANELS) + [1.2])
+    families = _times(scores)
+    widths = [1.0] * len(PANELS) + [1.2] * bool(families)
+    figure = Figure(figsize=(2 + 3 * len(widths), 1.8 + 0.3 * len(scores)), layout="constrained")
+    panels = figure.subplots(1, len(widths), width_ratios=widths)
     for panel, (key, label) in zip(panels, PANELS.items(), strict=False):
         _draw_problems(panel, {name: [run[key] for run in runs] for name, runs in scores.items()})
         panel.set_xlabel(label)
         panel.tick_params(axis="y", labelleft=panel is panels[0])
-    for panel in panels[1:-1]:
+    mse, loss, gap = panels[: len(PANELS)]
+    for row, runs in enumerate(scores.values()):
+        errors = [run["loss_error"] for run in runs]
+        loss.errorbar([run["loss"] for run in runs], [row] * len(runs), xerr=errors, **ERROR)
+        gap.plot([run["gap_noise"] for run in runs], [row] * len(runs), "|", color="gray", ms=10)
+    gap.plot([], [], "|", color="gray", ms=10, label="noise of Monte Carlo alone")
+    gap.legend(loc="upper right")
+    for panel in (loss, gap):
         panel.locator_params(axis="x", nbins=4)
     if any(run["mse"] > 0 for runs in scores.values() for run in runs):
-        panels[0].set_xscale("log")
-    _draw_times(panels[-1], scores)
+        mse.set_xscale("log")
+    if families:
+        _draw_times(panels[-1], families)
     return figure
 
 
@@ -47,20 +63,24 @@ def _draw_problems(panel: Axes, values: Mapping[str, Sequence[float]]) -> None:
     panel.grid(alpha=0.3)
 
 
-def _draw_times(panel: Axes, scores: Mapping[str, Sequence[Mapping[str, float]]]) -> None:
+def _times(scores: Mapping[str, Sequence[Mapping[str, float]]]) -> dict[str, dict[int, float]]:
+    """The shortest time of training, in s, by family and number of states."""
     families: dict[str, dict[int, float]] = {}
     for name, runs in scores.items():
         if found := FAMILY.fullmatch(name):
             # Other processes on the machine only lengthen a time.
             families.setdefault(found[1], {})[int(found[2])] = min(run["seconds"] for run in runs)
+    return families
+
+
+def _draw_times(panel: Axes, families: Mapping[str, Mapping[int, float]]) -> None:
     for family, times in families.items():
         panel.plot(sorted(times), [times[n] for n in sorted(times)], "o-", label=family)
-    if families:
-        numbers = sorted({n for times in families.values() for n in times})
-        panel.set_xscale("log")
-        panel.set_xticks(numbers, list(map(str, numbers)))
-        panel.minorticks_off()
-        panel.set_ylim(bottom=0)
-        panel.legend()
+    numbers = sorted({n for times in families.values() for n in times})
+    panel.set_xscale("log")
+    panel.set_xticks(numbers, list(map(str, numbers)))
+    panel.minorticks_off()
+    panel.set_ylim(bottom=0)
+    panel.legend()
     panel.set(xlabel="number of states n", ylabel="time of training, fastest seed (s)")
     panel.grid(alpha=0.3)
