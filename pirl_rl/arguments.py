@@ -60,10 +60,10 @@ def checked_points(
         raise ArgumentError(message) from None
     if not bool(((times >= 0) & (times <= horizon * (1 + ROUNDING))).all()):
         raise ArgumentError(f"tau: expected 0 <= tau <= horizon = {horizon} s, got {tau}")
-    far = ~_far_box(problem.states).contains(state)
-    if bool(far.any()):
-        message = f"x: {int(far.sum())} of {far.numel()} states lie far outside the box of states {problem.states}"
-        warnings.warn(f"{message}; nothing is learned there", stacklevel=3)
+    if not bool(_far_box(problem.states).contains(state).all()):
+        # The text has no numbers of these states, so that Python shows it once and not at each step of a simulation.
+        message = f"x: some states lie far outside the box of states {problem.states}; nothing is learned there"
+        warnings.warn(message, stacklevel=3)
     return times, state
 
 

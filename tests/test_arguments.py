@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -66,5 +68,10 @@ def test_states_far_outside_the_box_are_warned_of_and_angles_are_not(recwarn):
     for x in (near, turned):
         pirl_rl.monte_carlo(PROBLEM, straight, 1.0, x, rollouts=4, dt=0.1)
     assert not [warning for warning in recwarn if "far outside" in str(warning.message)]
-    with pytest.warns(UserWarning, match=r"x: 1 of 2 states lie far outside the box of states Box\("):
+    with pytest.warns(UserWarning, match=r"x: some states lie far outside the box of states Box\("):
         pirl_rl.monte_carlo(PROBLEM, straight, 1.0, X * torch.tensor([[9.0], [1.0]]), rollouts=4, dt=0.1)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("default")
+        for factors in ([[9.0], [1.0]], [[9.0], [9.0]], [[1.0], [8.0]]):
+            pirl_rl.monte_carlo(PROBLEM, straight, 1.0, X * torch.tensor(factors), rollouts=4, dt=0.1)
+    assert len([warning for warning in found if "far outside" in str(warning.message)]) == 1
