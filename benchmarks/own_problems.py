@@ -2,7 +2,7 @@
 
     python benchmarks/own_problems.py [NAME ...] [--seed 50] [--settings KEY=VALUE ...] [--out FOLDER] [--json FILE]
 
-docs/recipe.md says which of the problems had a part in choices, and in which. V and the success of the learned policy
+docs/suite.md says which of the problems had a part in choices, and in which. V and the success of the learned policy
 are compared with the grid, in the way of the suite, at 400 states with 1,000 paths from each. There is no truth with
 three states and two controls, or with more states. Bearing and Mirror are exceptions: they are compared with the
 products of the grids of their independent subsystems. A run takes minutes. A finished run is loaded and not trained

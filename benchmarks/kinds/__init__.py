@@ -6,7 +6,7 @@ from benchmarks.kinds.cycles import JetLag, PowerSwing, Runaway, Searchlight
 from benchmarks.kinds.demands import Backburn, ChemoWard, IslandGrid, VaccineStock
 from benchmarks.kinds.masses import Crosswind, Gusty, Lander, Orbit, Servo, Sprint, VanDerPol
 from benchmarks.kinds.mixtures import Bearing, Mirror, Mixture
-from benchmarks.kinds.passages import FastRiver, Glider, SlotChange, StraitFerry, TwoLink
+from benchmarks.kinds.passages import FastRiver, Glider, SlotChange, StraitFerry, TackingYacht, TwoLink
 from benchmarks.kinds.plants import Epidemic, Investor, Reactor, Reservoir, Toggle, Tokens, TwoTanks
 from benchmarks.kinds.stores import FastCharge, Ferment, Fishery, Forager
 from benchmarks.kinds.swings import Duffing, MountainCar, QuietStance, Swingup
@@ -21,5 +21,6 @@ KINDS += (Investor, Runaway, JetLag, Searchlight, PowerSwing, Forager, Ferment, 
 KINDS += (Bearing, Mirror, Duffing, MountainCar, Swingup, Pursuit, Rooms, Anaesthesia)
 KINDS += (LotkaVolterra, Chain, Unicycle, Rendezvous, FastRiver, Glider, Reactor, Fishery)
 KINDS += (VaccineStock, Backburn, ChemoWard, IslandGrid, StraitFerry, QuietStance, LynxAndHare, HerdImmunity)
+KINDS += (TackingYacht,)
 
 PROBLEMS = {kind.__name__: kind for kind in KINDS}

@@ -1,4 +1,4 @@
-"""A satellite, an arm, a boat, a ferry and a glider: obstacles are passed on either side, or against time."""
+"""A satellite, an arm, a boat, a ferry, a yacht and a glider: obstacles are passed on either side, or against time."""
 
 from __future__ import annotations
 
@@ -150,3 +150,32 @@ class StraitFerry(ReachAvoidProblem):
         island = (x - x.new_tensor([3.0, 4.5])).norm(dim=-1) - 1.4
         along, across = x.unbind(-1)
         return rows(island, along + 8.0, 14.0 - along, across, 8.0 - across)
+
+
+class TackingYacht(ReachAvoidProblem):
+    """Sail to a windward mark in 6 minutes, past an L-shaped reef; a yacht makes no way within 30 degrees of the wind.
+
+    Lengths are in hectometres. The heading is 0 straight into the wind, and the control is the rudder. Shifts of the
+    wind and the current make the noise.
+    """
+
+    horizon = 6.0  # minutes
+    states = Box([-2.5, -2.0, -math.pi], [2.5, 2.5, math.pi], periodic=[2])
+    controls = Box([-1.0], [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        heading = x[..., 2]
+        speed = 1.8 * ((heading.abs() - 0.52) / 0.35).clamp(0.0, 1.0)
+        return torch.stack([speed * heading.sin() + 0.2, speed * heading.cos() - 0.1, 2.5 * u[..., 0]], -1)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.diag_embed(x.new_tensor([0.2, 0.2, 0.5]).expand_as(x))
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return (x[..., :2] - x.new_tensor([0.0, 1.8])).norm(dim=-1) - 0.5
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        east, north = x[..., 0], x[..., 1]
+        shank = torch.maximum((east - 1.0).abs() - 0.2, (north - 0.1).abs() - 0.9)
+        foot = torch.maximum((east - 0.3).abs() - 0.9, (north + 0.6).abs() - 0.2)
+        return torch.minimum(shank, foot)
