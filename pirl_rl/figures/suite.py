@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 PANELS = {
     "mse": "mean square error of V",
     "loss": "loss of success",
-    "gap": "mean |V - Monte Carlo|",
+    "gap": "mean |V - Monte Carlo|, grey: noise alone",
 }
 """The measured quantities that are drawn by problem, with their labels."""
 
@@ -44,8 +44,6 @@ def draw_suite(scores: Mapping[str, Sequence[Mapping[str, float]]]) -> Figure:
         errors = [run["loss_error"] for run in runs]
         loss.errorbar([run["loss"] for run in runs], [row] * len(runs), xerr=errors, **ERROR)
         gap.plot([run["gap_noise"] for run in runs], [row] * len(runs), "|", color="gray", ms=10)
-    gap.plot([], [], "|", color="gray", ms=10, label="noise of Monte Carlo alone")
-    gap.legend(loc="upper right")
     for panel in (loss, gap):
         panel.locator_params(axis="x", nbins=4)
     if any(run["mse"] > 0 for runs in scores.values() for run in runs):
