@@ -16,7 +16,7 @@ PANELS = {
 }
 """The measured quantities that are drawn by problem, with their labels."""
 
-ERROR: dict[str, Any] = {"fmt": "none", "ecolor": "C0", "elinewidth": 0.8, "alpha": 0.5}
+ERROR_BARS: dict[str, Any] = {"fmt": "none", "ecolor": "C0", "elinewidth": 0.8, "alpha": 0.5}
 """The style of the bars of standard errors."""
 
 FAMILY = re.compile(r"(\w+)-(\d+)")
@@ -42,7 +42,7 @@ def draw_suite(scores: Mapping[str, Sequence[Mapping[str, float]]]) -> Figure:
     mse, loss, gap = panels[: len(PANELS)]
     for row, runs in enumerate(scores.values()):
         errors = [run["loss_error"] for run in runs]
-        loss.errorbar([run["loss"] for run in runs], [row] * len(runs), xerr=errors, **ERROR)
+        loss.errorbar([run["loss"] for run in runs], [row] * len(runs), xerr=errors, **ERROR_BARS)
         gap.plot([run["gap_noise"] for run in runs], [row] * len(runs), "|", color="gray", ms=10)
     for panel in (loss, gap):
         panel.locator_params(axis="x", nbins=4)
