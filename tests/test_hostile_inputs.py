@@ -166,6 +166,7 @@ def of_own(name: str, *settings: str) -> tuple[str, ...]:
 COMMANDS = {
     "unknown experiment": (train, ("+experiment=nowhere",), "experiment: expected one of cartpole, "),
     "unknown logger": (train, (*SMALL, "logger=paper"), "logger: expected one of csv, none"),
+    "experiment that is no YAML": (train, ("--config-dir=.", "+experiment=bad"), r"while parsing .*bad.yaml\", line 1"),
     "setting without a key": (train, (*SMALL, "=3"), "=3: expected key=value, got no key"),
     "setting with open brackets": (train, (*SMALL, "pirl.final=[1"), r"pirl.final=\[1: expected key=value"),
     "negative updates": (train, (*SMALL, "trainer.updates=-5"), "trainer.updates: expected an integer >= 1, got -5"),
@@ -256,11 +257,13 @@ def test_a_call_that_makes_no_sense_is_refused(name, run, tmp_path, monkeypatch)
 
 @pytest.fixture
 def workplace(trained, tmp_path, monkeypatch) -> Path:
-    """A folder with a run and a module of a user's problems."""
+    """A folder with a run, a module of a user's problems, and a user's experiment that is no YAML."""
     monkeypatch.syspath_prepend(str(tmp_path))
     shutil.copytree(trained, tmp_path / "run")
     (tmp_path / "own.py").write_text(OWN)
     (tmp_path / "broken.py").write_text("def f(:\n")
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "bad.yaml").write_text("env: {dt: [")
     for module in ("own", "broken"):
         monkeypatch.delitem(sys.modules, module, raising=False)
     return tmp_path

@@ -10,6 +10,7 @@ import inspect
 import re
 from collections.abc import Sequence
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import hydra
@@ -115,8 +116,9 @@ def check_overrides(texts: Sequence[str]) -> None:
 
     Raises:
         ConfigError: with the override, or with the choices of its group.
+        YAMLError: a chosen file in the user's own folder cannot be read; the message names the file and the line.
     """
-    parser = OverridesParser.create()
+    parser, folder = OverridesParser.create(), _users_folder(texts)
     for text in texts:
         if text.startswith("-") or "=" not in text:
             continue
@@ -128,12 +130,23 @@ def check_overrides(texts: Sequence[str]) -> None:
         key, chosen = override.key_or_group, None if override.is_sweep_override() else override.value()
         if not key:
             raise ConfigError(f"{text}: expected key=value, got no key")
+        if folder is not None and (own := folder / key / f"{chosen}.yaml").is_file():
+            OmegaConf.load(own)  # Hydra would end with a traceback where the file is no YAML
         group = CONF / key
         if not (group.is_dir() and isinstance(chosen, str)) or any(text.startswith(OTHER_FOLDERS) for text in texts):
             continue
         if not (group / f"{chosen}.yaml").is_file():
             known = ", ".join(sorted(path.stem for path in group.glob("*.yaml")))
             raise ConfigError(f"{key}: expected one of {known}, got {chosen!r}")
+
+
+def _users_folder(texts: Sequence[str]) -> Path | None:
+    """The folder of the user's own choices, which Hydra takes as `--config-dir FOLDER` or `--config-dir=FOLDER`."""
+    for flag, following in zip(texts, [*texts[1:], ""], strict=True):
+        name, _, folder = flag.partition("=")
+        if name in ("-cd", "--config-dir"):
+            return Path(folder or following)
+    return None
 
 
 def compose(name: str, overrides: Sequence[str], with_hydra: bool = False) -> DictConfig:
