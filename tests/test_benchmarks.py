@@ -13,10 +13,13 @@ from torch import Tensor
 from benchmarks import __main__ as command
 from benchmarks import dimension, ratios, time_to_accuracy
 from benchmarks.kinds import PROBLEMS
+from benchmarks.kinds.other_constants import CONSTANTS, OTHERS, drawn
 from benchmarks.ratios import WORSE, compare, table
+from pirl_rl import Box
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.grid import GridSolver
 from pirl_rl.layers import Dense
+from pirl_rl.problems import DubinsCar
 from pirl_rl.sampling.initial_states import sample_interior
 
 FAKE = """
@@ -192,3 +195,26 @@ def test_a_mixture_succeeds_with_the_product_of_the_probabilities_of_its_parts()
     assert 0.3 < together.mean() < 0.9
     error = torch.stack([p * (1 - p) for p in (together, *apart)]).sum().div(rollouts).sqrt() / len(x)
     assert (together - apart[0] * apart[1]).mean().abs() <= 3 * error
+
+
+@pytest.mark.parametrize("kind", CONSTANTS)
+def test_other_constants_are_those_of_the_suite_times_factors_of_a_half_to_two(kind):
+    usual, first = kind(), drawn(kind, 1)
+    for name in CONSTANTS[kind]:
+        one, other = (_numbers(getattr(problem, name)) for problem in (usual, first))
+        factors = other[one != 0] / one[one != 0]
+        torch.testing.assert_close(factors, factors[:1].expand_as(factors))
+        assert 0.5 <= factors[0] <= 2
+        assert factors[0] != 1
+        assert (_numbers(getattr(drawn(kind, 1), name)) == other).all()
+        assert (_numbers(getattr(drawn(kind, 2), name)) != other)[one != 0].all()
+        assert (_numbers(getattr(kind(), name)) == one).all()
+
+
+def _numbers(constant: object) -> Tensor:
+    return torch.tensor([*constant.low, *constant.high] if isinstance(constant, Box) else constant).double().reshape(-1)
+
+
+def test_a_problem_with_other_constants_has_a_name():
+    assert {*OTHERS} < {*PROBLEMS}
+    assert PROBLEMS["DubinsCar-3"]().speed == drawn(DubinsCar, 3).speed

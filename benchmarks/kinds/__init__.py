@@ -1,4 +1,4 @@
-"""Problems of other kinds than those of the suite, each written as a user would write it."""
+"""Problems of other kinds than those of the suite, each written as a user would write it, and with other constants."""
 
 from benchmarks.kinds.approaches import Chain, Pursuit, Rendezvous, Unicycle
 from benchmarks.kinds.compartments import Anaesthesia, HerdImmunity, LotkaVolterra, LynxAndHare, Rooms
@@ -6,6 +6,7 @@ from benchmarks.kinds.cycles import JetLag, PowerSwing, Runaway, Searchlight
 from benchmarks.kinds.demands import Backburn, ChemoWard, IslandGrid, VaccineStock
 from benchmarks.kinds.masses import Crosswind, Gusty, Lander, Orbit, Servo, Sprint, VanDerPol
 from benchmarks.kinds.mixtures import Bearing, Mirror, Mixture
+from benchmarks.kinds.other_constants import OTHERS
 from benchmarks.kinds.passages import FastRiver, Glider, SlotChange, StraitFerry, TackingYacht, TwoLink
 from benchmarks.kinds.plants import Epidemic, Investor, Reactor, Reservoir, Toggle, Tokens, TwoTanks
 from benchmarks.kinds.stores import FastCharge, Ferment, Fishery, Forager
@@ -23,4 +24,4 @@ KINDS += (LotkaVolterra, Chain, Unicycle, Rendezvous, FastRiver, Glider, Reactor
 KINDS += (VaccineStock, Backburn, ChemoWard, IslandGrid, StraitFerry, QuietStance, LynxAndHare, HerdImmunity)
 KINDS += (TackingYacht,)
 
-PROBLEMS = {kind.__name__: kind for kind in KINDS}
+PROBLEMS = {kind.__name__: kind for kind in KINDS} | OTHERS
