@@ -82,17 +82,16 @@ class Learner:
         self.polyak, self.target_warmup, self.actor_polyak = polyak, target_warmup, actor_polyak
         self.target_critics = FusedSoftUpdate(loss, "qvalue_network", polyak)
         self.target_actor = FusedSoftUpdate(loss, "actor_network", polyak)
-        device = loss.td_weight.device
-        rates: list[float] | list[Tensor] = [learning_rate, learning_rate]
+        device, rate = loss.td_weight.device, learning_rate
         self._largest: Tensor | None = None
         if recording.records(device):
             # What changes from one update to the next lies in memory that stays, for recordings of updates.
-            rates = [torch.full((), learning_rate, device=device) for _ in rates]
+            rate = torch.full((), learning_rate, device=device)
             for target in (self.target_critics, self.target_actor):
                 target.eps = torch.full((), target.eps, device=device)
             self._largest = torch.zeros((), device=device)
-        self.critic_optimizers = optimizers(loss.qvalue_network_params, rates[0], optimizer)
-        self.actor_optimizers = optimizers(loss.actor_network_params, rates[1], optimizer)
+        self.critic_optimizers = optimizers(loss.qvalue_network_params, rate, optimizer)
+        self.actor_optimizers = optimizers(loss.actor_network_params, rate, optimizer)
         self._prepared: dict[str, float] = {}
         self.train_actor = True
         self.gradients = Gradients(loss, compile)

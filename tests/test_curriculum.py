@@ -9,7 +9,7 @@ import pytest
 import torch
 from small import assert_same, at_update, interrupt, resumed, small_trainer
 
-from pirl_rl import checkpoint, recording
+from pirl_rl import checkpoint
 from pirl_rl.actor_rules import BestControl, ClippedSurrogate, LookAhead
 from pirl_rl.curriculum import Curriculum, Stage
 from pirl_rl.errors import ConfigError, Interrupted
@@ -252,12 +252,8 @@ def test_a_stage_with_a_rate_of_its_own_has_the_whole_decay_in_it(tmp_path):
     assert [rate[k] for k in (10, 20, 29)] == [wave(0.01, (k - 10) / 20) for k in (10, 20, 29)]
 
 
-@pytest.mark.parametrize("as_on_a_gpu", [False, True])
 @pytest.mark.parametrize("decay", ["cosine", "constant"])
-def test_the_learning_rate_of_the_actor_falls_as_the_square_root_of_that_of_the_critics(
-    decay, as_on_a_gpu, monkeypatch, tmp_path
-):
-    monkeypatch.setattr(recording, "records", lambda device: as_on_a_gpu)
+def test_the_learning_rate_of_the_actor_falls_as_the_square_root_of_that_of_the_critics(decay, tmp_path):
     learner = small_trainer(tmp_path, f"learner.decay={decay}", "learner.learning_rate=0.01").learner
     for progress in (0.0, 0.3, 0.8, 1.0):
         learner.prepare((1.0, 0.0, 0.0), progress, 0)
