@@ -34,8 +34,7 @@ class Learner:
         loss: the loss, with the critics, the actor and their target networks.
         learning_rate: the initial learning rate, for the critics and the actor.
         optimizer: "adam", or "muon" for the weights between hidden layers, see `pirl_rl.optimizers`.
-        decay: "cosine" lowers the learning rate to 0 for t from 0 to 1, by (1 + cos(pi t)) / 2 for the critics and by
-            its square root for the actor, which has less time to learn from a good V. "constant" keeps it.
+        decay: "cosine" lowers the learning rate to 0 by (1 + cos(pi t)) / 2 for t from 0 to 1, "constant" keeps it.
         actor_every: the number of critic updates for each update of the actor and the target networks, d_up in the
             paper.
         polyak: the rate, in (0, 1], at which the target networks follow the networks.
@@ -120,7 +119,7 @@ class Learner:
             k: the number of the update, counted from 0; the actor and the target networks are updated if it is a
                 multiple of `actor_every`.
             weights: (w_TD, w_HJB, w_BC) of the critic loss.
-            decay: the progress of the decay of the learning rates, in [0, 1].
+            decay: the progress of the decay of the learning rate, in [0, 1].
 
         Returns:
             The unweighted terms of the critic loss, and "loss_actor" of the actor's last update.
@@ -147,11 +146,10 @@ class Learner:
     # The next four are the parts of an update around the losses, which a population evaluates for all its members.
 
     def prepare(self, weights: Weights, decay: float, k: int) -> None:
-        """Set the loss weights, the learning rates and the rates of the targets; arguments are those of `update`."""
+        """Set the loss weights, the learning rate and the rate of the targets; arguments are those of `update`."""
         numbers = dict(zip(WEIGHTS, weights, strict=True))
         critics, actor = self._target_rates(k // self.actor_every)
-        numbers |= {"target_critics": 1 - critics, "target_actor": 1 - actor}
-        numbers |= {"learning_rate": self.rate(decay), "actor_learning_rate": self.actor_rate(decay)}
+        numbers |= {"learning_rate": self.rate(decay), "target_critics": 1 - critics, "target_actor": 1 - actor}
         for name, value in numbers.items():
             if self._prepared.get(name) != value:
                 self._set(name, value)
@@ -164,7 +162,7 @@ class Learner:
             target = getattr(self, name)
             target.eps = recording.renewed(target.eps, value)
         else:
-            for optimizer in self.critic_optimizers if name == "learning_rate" else self.actor_optimizers:
+            for optimizer in (*self.critic_optimizers, *self.actor_optimizers):
                 group = optimizer.param_groups[0]
                 group["lr"] = recording.renewed(group["lr"], value)
 
@@ -213,16 +211,9 @@ class Learner:
         return critics, critics if self.actor_polyak is None else max(self.actor_polyak, 1 / (1 + count))
 
     def rate(self, decay: float) -> float:
-        """The learning rate of the critics at a progress of its decay in [0, 1]."""
-        return self.learning_rate * self._left(decay) ** 2
-
-    def actor_rate(self, decay: float) -> float:
-        """The learning rate of the actor at a progress of its decay in [0, 1]."""
-        return self.learning_rate * self._left(decay)
-
-    def _left(self, decay: float) -> float:
-        """What is left of the actor's learning rate; its square is (1 + cos(pi t)) / 2 at the progress t."""
-        return 1.0 if self.decay == "constant" else math.cos(math.pi / 2 * min(decay, 1.0))
+        """The learning rate at a progress of its decay in [0, 1]."""
+        fraction = 1.0 if self.decay == "constant" else (1 + math.cos(math.pi * min(decay, 1.0))) / 2
+        return self.learning_rate * fraction
 
     def _judge(self, loss: Tensor, terms: Terms, update: int) -> None:
         """Refuse a loss at once, or on a GPU, which works ahead of Python, note it for `check`."""

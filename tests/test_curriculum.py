@@ -252,20 +252,6 @@ def test_a_stage_with_a_rate_of_its_own_has_the_whole_decay_in_it(tmp_path):
     assert [rate[k] for k in (10, 20, 29)] == [wave(0.01, (k - 10) / 20) for k in (10, 20, 29)]
 
 
-@pytest.mark.parametrize("decay", ["cosine", "constant"])
-def test_the_learning_rate_of_the_actor_falls_as_the_square_root_of_that_of_the_critics(decay, tmp_path):
-    learner = small_trainer(tmp_path, f"learner.decay={decay}", "learner.learning_rate=0.01").learner
-    for progress in (0.0, 0.3, 0.8, 1.0):
-        learner.prepare((1.0, 0.0, 0.0), progress, 0)
-        critic, actor = (
-            {float(group["lr"]) for optimizer in optimizers for group in optimizer.param_groups}
-            for optimizers in (learner.critic_optimizers, learner.actor_optimizers)
-        )
-        left = 1.0 if decay == "constant" else (1 + math.cos(math.pi * progress)) / 2
-        assert [*critic] == pytest.approx([0.01 * left], abs=1e-9)
-        assert [*actor] == pytest.approx([0.01 * math.sqrt(left)], abs=1e-9)
-
-
 @pytest.mark.parametrize("starts", ["faces.NearFaces", "undecided.UndecidedStates"])
 def test_starts_of_a_stage_may_stand_beside_those_of_the_environment(starts, tmp_path):
     stages = f"stages=[{{share: 1, initial_states: {{_target_: pirl_rl.sampling.{starts}}}}}]"
