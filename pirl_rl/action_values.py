@@ -71,8 +71,9 @@ def free_step(
     """The length (N,) in s, between two bounds, of an Euler step whose noise goes at most half way to A and to B.
 
     The ends of the cubature of `expected_ahead` are at +- sqrt(w h) sigma_k. With s = |sigma^T grad g| for the level g
-    of a set, they move g by at most s sqrt(w h) to first order, so that h = g^2 / (4 w s^2). The noise is that of two
-    opposite corners of the box of controls, whichever is stronger.
+    of a set, they move g by at most s sqrt(w h) to first order, so that h = g^2 / (4 w s^2). The noise is the strongest
+    of several controls: two opposite corners and the center of the box of controls, and the bounds of each coordinate
+    with the others in the middle.
 
     Args:
         problem: the physics.
@@ -80,9 +81,10 @@ def free_step(
         channels: the w columns of sigma that count, at least one.
         shortest, longest: the bounds of the length, in s.
     """
-    corners = torch.tensor([-1.0, 1.0], dtype=x.dtype, device=x.device).view(2, 1, 1)
-    u = problem.controls.denormalize(corners.expand(2, len(x), problem.controls.dim))
-    sigma = problem.diffusion(x.expand(2, -1, -1), u)[..., list(channels)]
+    axes = torch.eye(m := problem.controls.dim, dtype=x.dtype, device=x.device)
+    actions = torch.cat([axes, -axes, axes.new_zeros(1, m), axes.new_ones(1, m), -axes.new_ones(1, m)])
+    u = problem.controls.denormalize(actions.unsqueeze(1).expand(-1, len(x), m))
+    sigma = problem.diffusion(x.expand(len(u), -1, -1), u)[..., list(channels)].nan_to_num(0.0)
     levels = [problem.scaled_avoid_level] if problem.has_avoid_set else []
     if problem.objective == "reach-avoid":
         levels.append(problem.scaled_reached_level)

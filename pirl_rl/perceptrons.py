@@ -25,6 +25,10 @@ FAR = (2.0, 16.0, 128.0, 1_024.0, 8_192.0)
 LOG_WIDTH = 0.01
 """The width of `LogLevels`, as a share of the standard deviation of a level over the box of states."""
 
+QUANTILES, HEAVY = (0.1587, 0.5, 0.8413), 5.0
+"""The shares of a normal variable's values below -1, 0 and 1 deviations, and by which factor the deviation of a level
+may exceed half the distance of the outer two quantiles, before these take its place."""
+
 
 def perceptron(
     problem: ReachAvoidProblem,
@@ -63,7 +67,7 @@ def perceptron(
         layer, sampled, outside = _levels(problem)
         layers.append(layer)
         if sampled.shape[-1]:
-            middle, width = sampled.mean(0), sampled.std(0)
+            middle, width = _middle_and_width(sampled)
             low, high = (*low, *(middle - width).tolist()), (*high, *(middle + width).tolist())
             if log_levels:
                 layers.append(logs := LogLevels(LOG_WIDTH * width))
@@ -110,15 +114,30 @@ def _levels(problem: ReachAvoidProblem) -> tuple[Levels, Tensor, Tensor]:
     are outside A and B, (N,)."""
     x = problem.states.sample(LEVEL_POINTS, torch.Generator().manual_seed(0), torch.float64)
     sampled = _constraints(problem, None, x)
-    width = sampled.std(0)
-    # A level that is constant or infinite says nothing.
-    kept = ((width > 0) & width.isfinite()).nonzero().flatten().tolist()
-    levels = partial(_constraints, problem, kept if len(kept) < len(width) else None)
-    inside, rng = sampled[:, kept], torch.Generator().manual_seed(0)
+    numbers = sampled.isfinite()
+    least = torch.where(numbers, sampled, torch.inf).amin(0)
+    largest = torch.where(numbers, sampled, -torch.inf).amax(0)
+    # A level that is constant, or has no number anywhere, says nothing.
+    kept = (least < largest).nonzero().flatten().tolist()
+    levels = partial(_constraints, problem, kept if len(kept) < sampled.shape[-1] else None)
+    rng = torch.Generator().manual_seed(0)
     far = torch.cat([problem.states.expand(factor).sample(LEVEL_POINTS, rng, x.dtype) for factor in FAR])
-    if not levels(far).isfinite().all():
-        levels = partial(levels, ends=[*zip(inside.amin(0).tolist(), inside.amax(0).tolist(), strict=True)])
-    return Levels(levels, problem.states.dim), inside, problem.interior(x)
+    if not levels(torch.cat([x, far])).isfinite().all():
+        levels = partial(levels, ends=[*zip(least[kept].tolist(), largest[kept].tolist(), strict=True)])
+    return Levels(levels, problem.states.dim), levels(x), problem.interior(x)
+
+
+def _middle_and_width(sampled: Tensor) -> tuple[Tensor, Tensor]:
+    """The mean and the standard deviation (k,) of levels (N, k) over the box, between which the inputs are [-1, 1].
+
+    Where a few values deep in a set are much larger than all others, so that the deviation is that of these alone, they
+    are the median and half the distance of the quantiles that a normal variable has at one deviation.
+    """
+    middle, width = sampled.mean(0), sampled.std(0)
+    low, median, high = sampled.quantile(sampled.new_tensor(QUANTILES), dim=0)
+    usual = (high - low) / 2
+    heavy = (usual > 0) & (width > HEAVY * usual)
+    return torch.where(heavy, median, middle), torch.where(heavy, usual, width)
 
 
 def _range_of_logs(logs: LogLevels, sampled: Tensor) -> tuple[Tensor, Tensor]:

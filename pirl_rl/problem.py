@@ -30,6 +30,10 @@ RANDOM_STATES, WIDER = 100_000, 1.5
 UNIT_STATES, USUAL = 256, (2.0**-20, 2.0**20)
 """The number of random states whose levels show the unit of a level, and the range of sizes that need no other unit."""
 
+COMPARABLE = 8.0
+"""By which factor the levels of one set may vary more than one another without units: the nearest of several faces is
+that of the largest or the smallest level."""
+
 
 class ReachAvoidProblem(ABC):
     """The base class of problems.
@@ -186,9 +190,10 @@ class ReachAvoidProblem(ABC):
         return _normalized(self.free_target_constraints, x) + self.payoff.epsilon
 
     def scaled_reached_constraints(self, x: Tensor) -> Tensor:
-        """`reached_constraints` (*, k), each divided by a power of two, so that single precision has its square.
+        """`reached_constraints` (*, k), each divided by a power of two.
 
-        The power is 1 where levels have a usual size.
+        With it single precision has the squares of the levels, and the levels vary about as much as one another, so
+        that they can be compared. The powers are 1 where levels have a usual size and are alike.
         """
         return _divided(self.reached_constraints(x), self._reached_units)
 
@@ -219,8 +224,8 @@ class ReachAvoidProblem(ABC):
         return (self.reached_constraints(x) <= 0).all(-1)
 
     def failed(self, x: Tensor) -> Tensor:
-        """Whether states (*, n) are inside B, (*) bool."""
-        return self.avoid_level(x) <= 0
+        """Whether states (*, n) are inside B, (*) bool: in one of its constraints, also where others have no number."""
+        return (self.avoid_constraints(x) <= 0).any(-1)
 
     def interior(self, x: Tensor) -> Tensor:
         """Whether states (*, n) are outside both absorbing sets, where Eq. (hjb_pde) holds, (*) bool."""
@@ -253,13 +258,19 @@ def with_indicator(problem: ReachAvoidProblem) -> ReachAvoidProblem:
 
 
 def _units(levels: Callable[[Tensor], Tensor], states: Box) -> list[float]:
-    """Powers of two by which levels (*, k) are divided, or none where all have a usual size."""
-    size = levels(states.sample(UNIT_STATES, torch.Generator().manual_seed(0), torch.float64)).abs()
-    typical = torch.where(size.isfinite(), size, torch.nan).nanmedian(0).values.tolist()
-    unusual = [0 < one < USUAL[0] or one > USUAL[1] for one in typical]
-    if not any(unusual):
+    """Powers of two by which levels (*, k) are divided, or none where all have a usual size and vary alike.
+
+    A level has the size of its median absolute deviation over the box, or of its median where it hardly varies.
+    """
+    sampled = levels(states.sample(UNIT_STATES, torch.Generator().manual_seed(0), torch.float64))
+    sampled = torch.where(sampled.isfinite(), sampled, torch.nan)
+    deviation = (sampled - sampled.nanmedian(0).values).abs().nanmedian(0).values
+    size = torch.where(deviation > 0, deviation, sampled.abs().nanmedian(0).values)
+    known = size[size > 0]
+    usual = ((known >= USUAL[0]) & (known <= USUAL[1])).all()
+    if not len(known) or (usual and known.amax() <= COMPARABLE * known.amin()):
         return []
-    return [2.0 ** math.frexp(one)[1] if needs else 1.0 for one, needs in zip(typical, unusual, strict=True)]
+    return [2.0 ** math.frexp(one)[1] if one > 0 else 1.0 for one in size.tolist()]
 
 
 def _divided(levels: Tensor, units: Sequence[float]) -> Tensor:

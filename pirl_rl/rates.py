@@ -3,8 +3,9 @@
 Across a length L the drift f moves a path by |f| t in a time t, and the noise by |sigma| sqrt(t). For a coordinate, L
 is the width of the box. For a constraint g of A or B, which is -D where the set is deepest, the drift gives
 |grad g . f| t, the noise |sigma^T grad g| sqrt(t), and L is D. Where descent alone finds the set, they are taken half
-way between its face and its deepest points, where a smooth level has no slope. All rates are medians over the samples:
-the corners of a box may have rates that no path meets.
+way between its face and its deepest points, where a smooth level has no slope. Inside a set the physics may have no
+number: then the rates are those of the states next to it. All rates are medians over the samples: the corners of a box
+may have rates that no path meets.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def across_box(problem: ReachAvoidProblem, x: Tensor, u: Tensor) -> Move:
     width = 2 * problem.states.center_and_half_width(x)[1]
     speed = (problem.drift(x, u).abs() / width).amax(-1)
     spread = (problem.diffusion(x, u).norm(dim=-1) / width).amax(-1)
-    return Move("the box", speed.median().item(), spread.median().item())
+    return Move("the box", speed.nanmedian().item(), spread.nanmedian().item())
 
 
 def across_sets(problem: ReachAvoidProblem, x: Tensor, u: Tensor) -> list[Move]:
@@ -108,7 +109,7 @@ def control_rate(problem: ReachAvoidProblem, x: Tensor, u: Tensor) -> float:
     drift = torch.stack([problem.drift(x, held) for held in controls]) / width
     noise = torch.stack([problem.diffusion(x, held).square().sum(-1) for held in controls]).mean(0) / width**2
     reach = (drift.amax(0) - drift.amin(0)) / 2
-    return (reach * noise).amax(-1).median().item()
+    return (reach * noise).amax(-1).nanmedian().item()
 
 
 def _part(constraints: Callable[[Tensor], Tensor], index: int) -> Callable[[Tensor], Tensor]:
@@ -123,7 +124,8 @@ def _across(
     def holds(x: Tensor) -> Tensor:
         return (constraints(x) <= 0).all(-1)
 
-    lowest = x[constraints(x).amax(-1).argsort()[:STARTS]]
+    nearest_first = x[constraints(x).amax(-1).argsort()]
+    lowest, beside = nearest_first[:STARTS], nearest_first[~holds(nearest_first)][:STARTS]
     deep = descended(constraints, lowest, problem.states)
     found = torch.cat([x, deep])
     found = found[holds(found)]
@@ -132,11 +134,17 @@ def _across(
     depths = (-constraints(found)).amax(0).tolist()
     entering = holds(deep) & ~holds(lowest)
     face = bisected(holds, deep[entering], lowest[entering])
-    inside = torch.cat([x[holds(x)], (face + deep[entering]) / 2])
-    u = u[torch.arange(len(inside)) % len(u)]
-    f, sigma = problem.drift(inside, u), problem.diffusion(inside, u)
-    speed = torch.func.jvp(constraints, (inside,), (f,))[1].abs().median(0).values
-    columns = [torch.func.jvp(constraints, (inside,), (column,))[1] for column in sigma.unbind(-1)]
-    spread = torch.stack(columns).norm(dim=0).median(0).values
-    rates = zip(depths, speed.tolist(), spread.tolist(), strict=True)
-    return [Move(name, v / depth, s / depth) for depth, v, s in rates if depth > 0]
+    rates = _speeds(problem, constraints, torch.cat([x[holds(x)], (face + deep[entering]) / 2]), u)
+    if rates.isnan().any():
+        rates = torch.where(rates.isnan(), _speeds(problem, constraints, beside, u), rates)
+    pairs = zip(depths, *rates.tolist(), strict=True)
+    return [Move(name, v / depth, s / depth) for depth, v, s in pairs if depth > 0]
+
+
+def _speeds(problem: ReachAvoidProblem, constraints: Callable[[Tensor], Tensor], x: Tensor, u: Tensor) -> Tensor:
+    """The medians, over states (N, n) and controls (M, m), of the speed and of the noise of k levels, (2, k)."""
+    u = u[torch.arange(len(x)) % len(u)]
+    f, sigma = problem.drift(x, u), problem.diffusion(x, u)
+    speed = torch.func.jvp(constraints, (x,), (f,))[1].abs()
+    columns = [torch.func.jvp(constraints, (x,), (column,))[1] for column in sigma.unbind(-1)]
+    return torch.stack([speed, torch.stack(columns).norm(dim=0)]).nanmedian(1).values

@@ -12,6 +12,7 @@ import pirl_rl
 from pirl_rl import Box, ReachAvoidProblem, constant
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.networks import Critic
+from pirl_rl.rates import across_sets
 
 
 class Tank(ReachAvoidProblem):
@@ -96,3 +97,51 @@ def test_a_level_without_a_number_is_no_success():
     x, tau = torch.tensor([[0.3], [0.5]]), torch.tensor([2.0, 2.0])
     estimate = monte_carlo(Sinking(horizon=2.0), lambda tau, x: 0 * x, tau, x, rollouts=200, dt=0.05, crossing="bridge")
     assert (estimate.probability == 0).all()
+
+
+class Spiked(Tank):
+    """An avoid set whose level is infinite in a part of the box."""
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        return torch.where(x[..., 0] < 1.9, x[..., 1].abs() - 0.1, torch.inf)
+
+
+def test_a_level_that_is_infinite_in_a_part_of_the_box_is_an_input_of_networks():
+    level = Critic(Spiked(horizon=2.0), levels=True).layers[:1](torch.tensor([[1.0, 1.0, 0.4], [1.0, 1.95, 0.4]]))
+    torch.testing.assert_close(level[:, -1], torch.tensor([0.3, 0.9]), atol=0.01, rtol=0)
+
+
+def test_membership_of_one_constraint_needs_no_number_of_another():
+    class Two(Tank):
+        def avoid_constraints(self, x: Tensor) -> Tensor:
+            return torch.stack([x[..., 1], 0.1 - x[..., 0].log()], -1)
+
+    assert Two(horizon=2.0).failed(torch.tensor([[-0.1, -0.5], [1.0, 0.5], [-0.1, 0.5]])).tolist() == [
+        True,
+        False,
+        False,
+    ]
+
+
+def test_physics_without_a_number_inside_a_set_has_the_rates_beside_it():
+    class Root(Tank):
+        states = Box([-1.0], [1.0])
+
+        def drift(self, x: Tensor, u: Tensor) -> Tensor:
+            return 8 * u + (x.abs() - 0.02).sqrt()
+
+        def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+            return torch.full_like(x, 0.02).unsqueeze(-1)
+
+        def avoid_level(self, x: Tensor) -> Tensor:
+            return x[..., 0].abs() - 0.02
+
+    class Clamped(Root):
+        def drift(self, x: Tensor, u: Tensor) -> Tensor:
+            return 8 * u + (x.abs() - 0.02).clamp(min=0).sqrt()
+
+    rng = torch.Generator().manual_seed(0)
+    x, u = (box.sample(4_000, rng, torch.float64) for box in (Root.states, Root.controls))
+    found = [across_sets(problem(horizon=2.0), x, u)[-1] for problem in (Root, Clamped)]
+    assert found[0].speed == pytest.approx(found[1].speed, rel=0.2)
+    assert found[0].spread == pytest.approx(found[1].spread, rel=0.2)

@@ -7,10 +7,15 @@ import torch
 
 import pirl_rl
 from pirl_rl import Box, ReachAvoidProblem
+from pirl_rl.action_values import continued_value, free_step
+from pirl_rl.layers import LogLevels
+from pirl_rl.networks import Actor, Critic
 from pirl_rl.problems import DoubleIntegrator
+from pirl_rl.rates import across_sets
 from pirl_rl.sampling.boundary import face_weights
 from pirl_rl.sampling.faces import find_faces
 from pirl_rl.simulator import Simulator
+from pirl_rl.solution import Solution
 
 LENGTHS, TIME, FORCE, LEVELS = torch.tensor([1e3, 1e-3], dtype=torch.float64), 1e-2, 1e4, (100.0, 1e-3)
 SETTINGS = {
@@ -92,3 +97,101 @@ def test_a_problem_in_other_units_is_learned_alike(tmp_path):
     torch.testing.assert_close(values[1], values[0], atol=1e-4, rtol=0)
     torch.testing.assert_close(controls[1], controls[0], atol=1e-3, rtol=0)
     assert abs(runs[1].simulator.dt / TIME - runs[0].simulator.dt) < 1e-12
+
+
+class Slab(ReachAvoidProblem):
+    """A thin target between four pairs of oblique planes, each with a level in a unit of its own."""
+
+    horizon, states, controls = 1.0, Box([-1] * 4, [1] * 4), Box([-1], [1])
+    scales = (1.0, 1.0, 1.0, 1.0)
+
+    def drift(self, x, u):
+        return u.expand(*x.shape[:-1], 4)
+
+    def diffusion(self, x, u):
+        return 0.3 * torch.eye(4).to(x).expand(*x.shape[:-1], 4, 4)
+
+    def target_constraints(self, x):
+        normals = torch.linalg.qr(torch.randn(4, 4, generator=torch.Generator().manual_seed(1)).double())[0]
+        return torch.tensor(self.scales).to(x) * ((x @ normals.to(x) - 0.1).abs() - 0.01)
+
+
+@pytest.mark.parametrize("scales", [(1.0, 1e2, 1.0, 1e2), (1.0, 1e5, 1e-3, 1e5)])
+def test_a_thin_target_is_found_where_each_level_has_a_unit_of_its_own(scales):
+    problem = type("Scaled", (Slab,), {"scales": scales})()
+    assert len(find_faces(problem, torch.Generator().manual_seed(0)).points) == 8_192
+    x = problem.states.sample(4_000, torch.Generator().manual_seed(0), torch.float64)
+    u = problem.controls.sample(4_000, torch.Generator().manual_seed(1), torch.float64)
+    for one, other in zip(across_sets(Slab(), x, u), across_sets(problem, x, u), strict=True):
+        assert (other.speed, other.spread) == pytest.approx((one.speed, one.spread), rel=0.3)
+
+
+class Corner(ReachAvoidProblem):
+    """A square target and two walls, with a level of the second coordinate in a small unit."""
+
+    horizon, states, controls = 1.0, Box([-1, -1], [1, 1]), Box([-1, -1], [1, 1])
+    unit = 1.0
+
+    def drift(self, x, u):
+        return u
+
+    def diffusion(self, x, u):
+        return torch.diag_embed(0.1 + 0.2 * u.abs())
+
+    def target_constraints(self, x):
+        return torch.stack([x[..., 0].abs() - 0.5, self.unit * (x[..., 1].abs() - 0.5)], -1)
+
+    def avoid_constraints(self, x):
+        return torch.stack([x[..., 0] + 0.9, self.unit * (x[..., 1] + 0.9)], -1)
+
+
+def test_the_nearest_face_is_that_of_the_shortest_way_and_not_of_the_smallest_level():
+    one, other = Corner(), type("Millimetres", (Corner,), {"unit": 1_000.0})()
+    inside = torch.tensor([[0.1, 0.499], [0.499, 0.1], [-0.2, -0.45]])
+    outside = torch.tensor([[0.5, -0.898], [-0.898, 0.7], [0.52, 0.1]])
+    for problem in (one, other):
+        assert problem.reached(inside).all()
+        assert problem.interior(outside).all()
+    actor, critic = Actor(one, [8]), Critic(one, [8], action_input=False)
+    found = [
+        continued_value(Solution(problem, actor, critic), torch.full((3,), 0.5), inside) for problem in (one, other)
+    ]
+    torch.testing.assert_close(*found)
+    lengths = [free_step(problem, outside, [0, 1], 1e-9, 0.1) for problem in (one, other)]
+    torch.testing.assert_close(*lengths)
+    assert lengths[0].max() < 0.1
+
+
+def test_a_free_step_sees_noise_that_two_opposite_corners_of_the_controls_do_not_have():
+    class Difference(Corner):
+        def diffusion(self, x, u):
+            return 0.3 * (u[..., :1] - u[..., 1:]).unsqueeze(-1).expand(*x.shape[:-1], 2, 1)
+
+    class Middle(Corner):
+        def diffusion(self, x, u):
+            return 0.3 * (1 - u[..., :1] ** 2).unsqueeze(-1).expand(*x.shape[:-1], 2, 1)
+
+    x = torch.tensor([[-0.899, 0.7]])
+    for problem in (Difference(), Middle()):
+        # A noise of 0.3 goes half of the millimetre to the wall within (0.0005/0.3)^2 s.
+        assert free_step(problem, x, [0], 1e-9, 0.1).item() == pytest.approx((0.0005 / 0.3) ** 2, rel=1e-3)
+
+
+def test_levels_that_are_huge_deep_in_a_set_have_the_resolution_of_others():
+    class Disc(Corner):
+        def avoid_constraints(self, x):
+            return x.norm(dim=-1, keepdim=True) - 0.2
+
+    class Singular(Corner):
+        def avoid_constraints(self, x):
+            return 625 - x.norm(dim=-1, keepdim=True) ** -4
+
+    levels = []
+    for problem in (Disc(), Singular()):
+        logs = next(
+            layer for layer in Critic(problem, levels=True, log_levels=True).layers if isinstance(layer, LogLevels)
+        )
+        faces = torch.tensor([[1.0, 0.202, 0.0], [1.0, 0.3, 0.0]])
+        levels.append(logs(Critic(problem, levels=True).layers[:1](faces))[:, -1])
+    # 2 mm and 10 cm outside of the disc: both inputs tell them apart.
+    assert all(level[1] - level[0] > 1 for level in levels)
