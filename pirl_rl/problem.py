@@ -225,7 +225,9 @@ class ReachAvoidProblem(ABC):
 
     def failed(self, x: Tensor) -> Tensor:
         """Whether states (*, n) are inside B, (*) bool: in one of its constraints, also where others have no number."""
-        return (self.avoid_constraints(x) <= 0).any(-1)
+        if type(self).avoid_level is ReachAvoidProblem.avoid_level:
+            return (self.avoid_constraints(x) <= 0).any(-1)
+        return self.avoid_level(x) <= 0
 
     def interior(self, x: Tensor) -> Tensor:
         """Whether states (*, n) are outside both absorbing sets, where Eq. (hjb_pde) holds, (*) bool."""
