@@ -81,7 +81,8 @@ def free_step(
         channels: the w columns of sigma that count, at least one.
         shortest, longest: the bounds of the length, in s.
     """
-    axes = torch.eye(m := problem.controls.dim, dtype=x.dtype, device=x.device)
+    m = problem.controls.dim
+    axes = torch.eye(m, dtype=x.dtype, device=x.device)
     actions = torch.cat([axes, -axes, axes.new_zeros(1, m), axes.new_ones(1, m), -axes.new_ones(1, m)])
     u = problem.controls.denormalize(actions.unsqueeze(1).expand(-1, len(x), m))
     sigma = problem.diffusion(x.expand(len(u), -1, -1), u)[..., list(channels)].nan_to_num(0.0)

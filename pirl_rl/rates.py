@@ -135,7 +135,7 @@ def _across(
     entering = holds(deep) & ~holds(lowest)
     face = bisected(holds, deep[entering], lowest[entering])
     rates = _speeds(problem, constraints, torch.cat([x[holds(x)], (face + deep[entering]) / 2]), u)
-    if rates.isnan().any():
+    if rates.isnan().any() and len(beside):
         rates = torch.where(rates.isnan(), _speeds(problem, constraints, beside, u), rates)
     pairs = zip(depths, *rates.tolist(), strict=True)
     return [Move(name, v / depth, s / depth) for depth, v, s in pairs if depth > 0]
