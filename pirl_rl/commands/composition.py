@@ -10,6 +10,7 @@ import inspect
 import re
 from collections.abc import Sequence
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -142,7 +143,7 @@ def check_overrides(texts: Sequence[str]) -> None:
 
 def _users_folder(texts: Sequence[str]) -> Path | None:
     """The folder of the user's own choices, which Hydra takes as `--config-dir FOLDER` or `--config-dir=FOLDER`."""
-    for flag, following in zip(texts, [*texts[1:], ""], strict=True):
+    for flag, following in pairwise([*texts, ""]):
         name, _, folder = flag.partition("=")
         if name in ("-cd", "--config-dir"):
             return Path(folder or following)
