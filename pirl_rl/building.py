@@ -180,5 +180,6 @@ def convert(value: Any, expected: Any, key: str) -> Any:
         return value  # pydantic cannot check this type, for example a protocol
     except pydantic.ValidationError as error:
         name = getattr(expected, "__name__", None) if inspect.isclass(expected) else str(expected)
+        name = str(name).replace("collections.abc.Sequence", "list").replace("collections.abc.Mapping", "dict")
         reason = error.errors()[0]["msg"]
         raise ConfigError(f"{key}: expected {name}, got {value!r} ({reason})") from None

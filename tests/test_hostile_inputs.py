@@ -177,6 +177,7 @@ COMMANDS = {
     "no time step": (train, (*SMALL, "env.dt=0"), "env.dt: expected 0 < dt <= horizon"),
     "time step of text": (train, (*SMALL, "env.dt=soon"), "env.dt: expected float, got 'soon'"),
     "negative width": (train, (*SMALL, "actor.hidden=[-4]"), r"actor.hidden: expected widths .* got \[-4\]"),
+    "a width alone": (train, (*SMALL, "critic.hidden=64"), r"critic.hidden: expected list\[int\], got 64"),
     "no paths": (train, (*SMALL, "env.num_envs=0"), "env.num_envs: expected an integer >= 1, got 0"),
     "two weights": (train, (*SMALL, "pirl.final=[1,2]"), "expected three finite weights"),
     "unknown device": (train, (*SMALL, "device=toaster"), "device: expected auto, cpu or cuda"),
