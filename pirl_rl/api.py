@@ -6,7 +6,7 @@ import copy
 import importlib
 import inspect
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any, overload
@@ -99,6 +99,8 @@ def train(
     if problem is not None:
         _refuse_arguments(problem, settings)
     if seeds is not None:
+        if not isinstance(seeds, Iterable):
+            raise ArgumentError(f"seeds: expected a list of integers, as for seeds=[0, 1, 2], got {seeds!r}")
         settings["trainer.seeds"] = list(seeds)
     with warnings.catch_warnings():
         quiet_libraries()
@@ -135,7 +137,7 @@ def _subject(subject: Any) -> tuple[str, ReachAvoidProblem | None, dict[str, str
     if inspect.isclass(subject) and issubclass(subject, ReachAvoidProblem):
         _refuse_abstract(subject, "problem_or_experiment")
         if not _importable(subject):
-            return "own", subject(), {}, []
+            return "own", _made(subject, "problem_or_experiment"), {}, []
         return "own", None, {"env.problem._target_": f"{subject.__module__}.{subject.__name__}"}, [subject.__module__]
     if isinstance(subject, ReachAvoidProblem):
         return "own", subject, {}, []
@@ -153,6 +155,21 @@ def _refuse_abstract(kind: type[ReachAvoidProblem], argument: str) -> None:
     """
     if missing := ", ".join(sorted(kind.__abstractmethods__)):
         raise ArgumentError(f"{argument}: {kind.__qualname__} lacks {missing}")
+
+
+def _made(kind: type[ReachAvoidProblem], argument: str) -> ReachAvoidProblem:
+    """An object of a class of problems, which must need no arguments.
+
+    Raises:
+        ArgumentError: the class needs some.
+    """
+    try:
+        inspect.signature(kind).bind()
+    except TypeError as error:
+        raise ArgumentError(
+            f"{argument}: {kind.__qualname__} needs arguments ({error}), expected an object, {kind.__qualname__}(...)"
+        ) from None
+    return kind()
 
 
 def _refuse_arguments(problem: ReachAvoidProblem, settings: Mapping[str, Any]) -> None:
@@ -192,7 +209,7 @@ def check(
     """
     if inspect.isclass(problem) and issubclass(problem, ReachAvoidProblem):
         _refuse_abstract(problem, "problem")
-        problem = problem()
+        problem = _made(problem, "problem")
     return checking.check(problem, dt, substeps)
 
 

@@ -45,14 +45,17 @@ class Constant:
         return self._made[key]
 
 
-def constant(values: Sequence[float] | Sequence[Sequence[float]], like: Tensor) -> Tensor:
+def constant(values: float | Sequence[float] | Sequence[Sequence[float]] | np.ndarray, like: Tensor) -> Tensor:
     """Numbers as a tensor, made once for each dtype and device; it must not be changed in place.
 
     Args:
-        values: the numbers, (n,), or rows of them, (k, n).
+        values: one number, several (n,), or rows of them (k, n).
         like: a tensor with the dtype and on the device of the result.
     """
-    rows = tuple(tuple(row) if isinstance(row, Sequence) else float(row) for row in values)
+    numbers = values.tolist() if isinstance(values, np.ndarray) else values
+    rows: Any = numbers
+    if not isinstance(numbers, (int, float)):
+        rows = tuple(tuple(row) if isinstance(row, Sequence) else float(row) for row in numbers)
     if rows in _KEPT:
         return _KEPT[rows].like(like)
     if torch.compiler.is_compiling():

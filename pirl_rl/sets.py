@@ -28,13 +28,18 @@ class Box:
         periodic: numbers of the periodic axes, counted from 0.
 
     Raises:
-        ArgumentError: the corners have different lengths, are empty, not finite or not ordered, or `periodic` names an
-            axis that does not exist, or names one twice.
+        ArgumentError: the corners are no lists of numbers, have different lengths, are empty, not finite or not
+            ordered, or `periodic` names an axis that does not exist, or names one twice.
     """
 
     def __init__(self, low: Sequence[float], high: Sequence[float], periodic: Sequence[int] = ()):
-        self.low = tuple(float(value) for value in low)
-        self.high = tuple(float(value) for value in high)
+        try:
+            self.low = tuple(float(value) for value in low)
+            self.high = tuple(float(value) for value in high)
+        except (TypeError, ValueError):
+            raise ArgumentError(
+                f"Box: expected the lower and the upper corner as two lists of numbers, got {low!r} and {high!r}"
+            ) from None
         if len(self.low) != len(self.high) or not self.low:
             raise ArgumentError(
                 f"Box: low and high need the same length >= 1, got {len(self.low)} and {len(self.high)}"

@@ -79,6 +79,14 @@ def test_the_run_comes_back_open(run):
         assert ours.shape == ((9, 1) if name in ("gradient", "policy") else (9,))
 
 
+@pytest.mark.parametrize("name", ["value", "residual", "gradient", "policy"])
+def test_a_single_state_has_the_result_of_a_row(name, run):
+    one, row = (getattr(run[1], name)(1.0, x) for x in (np.array([0.3]), np.array([[0.3]])))
+    assert one.shape == row.shape[1:]
+    assert np.array_equal(one, row[0])
+    assert run[1].reach_avoid_set(0.5, 1.0)([0.3]).shape == ()
+
+
 def test_gradient_is_the_slope_of_the_value(run):
     x, h = np.linspace(-1.5, 1.5, 7)[:, None], 1e-2
     value = run[1].solution.raw_value

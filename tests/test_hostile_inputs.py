@@ -82,6 +82,18 @@ class Abstract(pirl_rl.ReachAvoidProblem):
 """
 
 
+class Windy(ZermeloBoat):
+    def __init__(self, wind, size=torch.abs):
+        super().__init__()
+        self.wind, self.size = wind, size
+
+    def drift(self, x, u):
+        return super().drift(x, u) + self.wind(x)
+
+    def avoid_constraints(self, x):
+        return 1 - self.size(x)
+
+
 def sail(policy, tau=1.0, x=SHORE, **settings):
     return pirl_rl.monte_carlo(ZermeloBoat(), policy, tau, x, rollouts=4, dt=0.1, **settings)
 
@@ -145,6 +157,12 @@ CALLS = {
     ),
     "weights outside the run": (lambda run: pirl_rl.load_run(run.folder, weights="../last.pt"), "name of a file in"),
     "training of a number": (lambda run: pirl_rl.train(42), "expected the name of an experiment"),
+    "box of numbers": (lambda run: pirl_rl.Box(-1.0, 1.0), "Box: expected the lower and the upper corner as two lists"),
+    "check of a class with arguments": (lambda run: pirl_rl.check(Windy), r"problem: Windy needs arguments \(.*'wind'"),
+    "training of a class with arguments": (lambda run: pirl_rl.train(Windy), "env.problem.wind: a value is missing"),
+    "physics of numpy": (lambda run: pirl_rl.check(Windy(np.sin)), "need functions of torch, such as torch.sin"),
+    "levels of numpy": (lambda run: pirl_rl.check(Windy(torch.sin, np.abs)), "need functions of torch"),
+    "one seed": (lambda run: pirl_rl.train("reach1d", seeds=3), r"seeds: expected a list of integers, .* got 3"),
     "training of nothing known": (lambda run: pirl_rl.train("nowhere"), "experiment: expected one of cartpole"),
     "training of an unknown setting": (lambda run: pirl_rl.train("reach1d", speed=3), "speed: expected one of"),
     "training into a finished run": (

@@ -11,6 +11,7 @@ from oracles import PROBLEMS, SHIPPED, Corner, FullNoise, name
 from torch import Tensor
 
 from pirl_rl.checking import examine
+from pirl_rl.constants import constant
 from pirl_rl.errors import ArgumentError, ProblemError
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.operators import generator
@@ -374,3 +375,11 @@ def test_a_closed_form_is_that_of_the_indicator():
     problem.payoff = LipschitzPayoff(0.2)
     assert closed_form(problem, tau, x) is None
     assert not [finding for finding in examine(problem) if finding.level == "error"]
+
+
+def test_constants_may_be_numbers_lists_and_arrays():
+    like = torch.zeros(2, dtype=torch.float64)
+    assert constant(0.3, like).shape == ()
+    for values in ([[0.0, 1.0], [-1.0, 0.0]], np.array([[0.0, 1.0], [-1.0, 0.0]])):
+        assert torch.equal(constant(values, like), torch.tensor([[0.0, 1.0], [-1.0, 0.0]], dtype=torch.float64))
+    assert torch.equal(constant(np.array([1.0, 2.0]), like), torch.tensor([1.0, 2.0], dtype=torch.float64))

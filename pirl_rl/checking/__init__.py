@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 
 from pirl_rl.checking import answers, dynamics, level_sets, methods
-from pirl_rl.checking.findings import Finding, found, method_that_raised, raised_in, report
+from pirl_rl.checking.findings import Finding, found, hint, method_that_raised, raised_in, report
 from pirl_rl.checking.samples import Samples
 from pirl_rl.errors import ArgumentError, ProblemError
 from pirl_rl.problem import ReachAvoidProblem
@@ -90,7 +90,8 @@ def attributes(problem: ReachAvoidProblem) -> Iterator[Finding]:
     """The horizon and the boxes must be there before any method can be called."""
     horizon = getattr(problem, "horizon", None)
     if not isinstance(horizon, (int, float)) or not 0 < horizon < math.inf:
-        yield found(problem, "error", "horizon", f"expected a finite number of seconds above 0, got {horizon!r}.")
+        message = f"expected a finite number of seconds above 0, an int or a float, got {horizon!r}."
+        yield found(problem, "error", "horizon", message)
     for name in ("states", "controls"):
         box = getattr(problem, name, None)
         if not isinstance(box, Box):
@@ -109,5 +110,6 @@ def _guarded(one: Check, samples: Samples) -> list[Finding]:
     try:
         return [*one(samples)]
     except Exception as error:
-        message = f"expected a result at every state, got {type(error).__name__}: {error}".partition("\n")[0] + "."
+        got = f"{type(error).__name__}: {error}".partition("\n")[0]
+        message = f"expected a result at every state, got {got}{hint(got)}."
         return [found(samples.problem, "error", method_that_raised(error), message, place=raised_in(error))]

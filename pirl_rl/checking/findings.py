@@ -15,6 +15,9 @@ from pirl_rl.problem import ReachAvoidProblem
 
 Level = Literal["error", "warning", "note"]
 
+OF_NUMPY = ("numpy()", "access data pointer")
+"""What torch's errors about functions of numpy contain."""
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -73,6 +76,13 @@ def method_that_raised(error: BaseException) -> str:
     """The name of the problem's method that was called when an exception was raised; the drift if it is not known."""
     names = (frame.name for frame in users_frames(error))
     return next((name for name in names if hasattr(ReachAvoidProblem, name)), "drift")
+
+
+def hint(error: str) -> str:
+    """What else to say of an error of torch: that of a function of numpy advises to lose the derivatives."""
+    if not any(sign in error for sign in OF_NUMPY):
+        return ""
+    return " (physics and levels need functions of torch, such as torch.sin and torch.maximum, and not those of numpy)"
 
 
 def report(findings: Iterable[Finding], levels: Iterable[Level] = ("error", "warning", "note")) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from pirl_rl.checking.findings import Finding, found, raised_in
+from pirl_rl.checking.findings import Finding, found, hint, raised_in
 from pirl_rl.checking.samples import LEVELS, Function, Samples
 from pirl_rl.errors import ProblemError
 from pirl_rl.structure import check_problem
@@ -135,9 +135,8 @@ def derivatives(samples: Samples) -> Iterator[Finding]:
         else:
             continue
         if isinstance(slope, str):
-            yield found(
-                problem, "error", part, f"expected a function that torch can differentiate, got {slope}; {need}."
-            )
+            message = f"expected a function that torch can differentiate, got {slope}{hint(slope)}; {need}."
+            yield found(problem, "error", part, message)
         elif part in LEVELS and (bad := ~slope.isfinite().all(-1) & problem.interior(x)).any():
             message = (
                 f"expected finite derivatives, got NaN or infinite ones at {_share(bad)} of the states. A branch of "

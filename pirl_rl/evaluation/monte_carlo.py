@@ -6,7 +6,7 @@ indicator it is the probability to reach A before B within tau or, in an invaria
 
 from __future__ import annotations
 
-from numbers import Real
+from numbers import Integral, Real
 from statistics import NormalDist
 from typing import NamedTuple, TypeVar
 
@@ -129,13 +129,13 @@ def monte_carlo(
     times, points = checked_points(problem, tau, x, *kind)
     if points.ndim != 2:
         raise ArgumentError(f"x: expected states of shape (N, {problem.states.dim}), got {tuple(points.shape)}")
-    if not (isinstance(rollouts, int) and rollouts >= 1):
+    if not (isinstance(rollouts, Integral) and rollouts >= 1):
         raise ArgumentError(f"rollouts: expected an integer >= 1, got {rollouts!r}")
     if dt is None:
         dt, substeps = propose_time_steps(problem, substeps=substeps, crossing=crossing)[:2]
     simulator = Simulator(problem, dt, 1 if substeps is None else substeps, crossing)
     rng = seeded(seed, points.device)
-    mean = mean_payoff(simulator, checked_policy(policy, problem), times, points, rollouts, rng)
+    mean = mean_payoff(simulator, checked_policy(policy, problem), times, points, int(rollouts), rng)
     known = _known(problem, times, problem.states.wrap(points))[0]
     low, high = (torch.where(known, mean, end) for end in wilson_interval(mean * rollouts, rollouts, confidence))
     if isinstance(x, Tensor):

@@ -113,7 +113,7 @@ class Chain:
         self.shared = not (moves or controlled)
         noise, blocks, gains = None, [], []
         for u in controls[:1] if self.shared else controls:
-            control = torch.from_numpy(np.ascontiguousarray(u))
+            control = torch.from_numpy(np.array(u))
             drift, sigma = problem.drift(x, control), problem.diffusion(x, control)
             lost = ~sigma.isfinite().all(-1).all(-1) | (moves & ~drift.isfinite().all(-1))
             if noise is None or controlled:

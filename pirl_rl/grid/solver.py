@@ -86,7 +86,7 @@ class GridSolver:
         points = POINTS[n] if points is None else points
         self.points = (points,) * n if isinstance(points, int) else tuple(points)
         if len(self.points) != n or min(self.points) < 5:
-            raise ArgumentError(f"points: expected {n} numbers >= 5, or one, got {points}")
+            raise ArgumentError(f"points: expected an integer >= 5, or one for each of the {n} axes, got {points}")
         for name, number in (("steps", steps), ("levels", levels)):
             if number is not None and number < 2:
                 raise ArgumentError(f"{name}: expected a number >= 2, got {number}")

@@ -265,7 +265,7 @@ class Run:
     def _call(self, function: Callable[[Tensor, Tensor], Tensor], tau, x):
         times, state, answer = self._arguments(tau, x)
         result = function(times.reshape(-1), state.reshape(-1, state.shape[-1]))
-        return answer(result.reshape(*times.shape, *result.shape[1:]))
+        return answer(result.reshape((*times.shape, *result.shape[1:])))
 
     def _starts(self, tau, x) -> tuple[Tensor, Tensor, Callable[[Tensor], Any]]:
         """The same as `_arguments` for the starts of paths, whose states have the shape (N, n)."""
