@@ -91,7 +91,17 @@ class Windy(ZermeloBoat):
         return super().drift(x, u) + self.wind(x)
 
     def avoid_constraints(self, x):
-        return 1 - self.size(x)
+        return 2 - self.size(x)
+
+
+class Planes(Windy):
+    def planes(self):
+        return {}
+
+
+class Exact(Windy):
+    def exact_value(self, tau, x):
+        return np.ones(len(x))
 
 
 def sail(policy, tau=1.0, x=SHORE, **settings):
@@ -162,6 +172,8 @@ CALLS = {
     "training of a class with arguments": (lambda run: pirl_rl.train(Windy), "env.problem.wind: a value is missing"),
     "physics of numpy": (lambda run: pirl_rl.check(Windy(np.sin)), "need functions of torch, such as torch.sin"),
     "levels of numpy": (lambda run: pirl_rl.check(Windy(torch.sin, np.abs)), "need functions of torch"),
+    "planes as a method": (lambda run: pirl_rl.check(Planes(torch.sin)), r"Planes.planes \(.*: expected a result"),
+    "exact value of numpy": (lambda run: pirl_rl.check(Exact(torch.sin)), r"Exact.exact_value \(.*: expected a result"),
     "one seed": (lambda run: pirl_rl.train("reach1d", seeds=3), r"seeds: expected a list of integers, .* got 3"),
     "training of nothing known": (lambda run: pirl_rl.train("nowhere"), "experiment: expected one of cartpole"),
     "training of an unknown setting": (lambda run: pirl_rl.train("reach1d", speed=3), "speed: expected one of"),

@@ -112,4 +112,5 @@ def _guarded(one: Check, samples: Samples) -> list[Finding]:
     except Exception as error:
         got = f"{type(error).__name__}: {error}".partition("\n")[0]
         message = f"expected a result at every state, got {got}{hint(got)}."
-        return [found(samples.problem, "error", method_that_raised(error), message, place=raised_in(error))]
+        method = method_that_raised(error, one.__name__)
+        return [found(samples.problem, "error", method, message, place=raised_in(error))]

@@ -72,9 +72,13 @@ def raised_in(error: BaseException) -> str:
     return f"{Path(frames[-1].filename).name}, line {frames[-1].lineno}" if frames else ""
 
 
-def method_that_raised(error: BaseException) -> str:
-    """The name of the problem's method that was called when an exception was raised; the drift if it is not known."""
-    names = (frame.name for frame in users_frames(error))
+def method_that_raised(error: BaseException, check: str) -> str:
+    """The name of the problem's method that was called when an exception was raised.
+
+    Where its result led to the exception, a check that has the name of a method, such as "planes", is about this one.
+    Where nothing is known it is the drift.
+    """
+    names = [*(frame.name for frame in users_frames(error)), check]
     return next((name for name in names if hasattr(ReachAvoidProblem, name)), "drift")
 
 
