@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import importlib
 import inspect
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any, overload
@@ -19,7 +20,7 @@ from pirl_rl.commands.population import member_names
 from pirl_rl.commands.settings import compose_run, run_folder, typed_settings
 from pirl_rl.commands.train import go_on, train_new
 from pirl_rl.configuration import load_config
-from pirl_rl.errors import ArgumentError, ConfigError
+from pirl_rl.errors import ArgumentError, ConfigError, Interrupted
 from pirl_rl.evaluation import evaluate as call_evaluators
 from pirl_rl.evaluation import metrics_of
 from pirl_rl.evaluation.monte_carlo import monte_carlo
@@ -114,16 +115,27 @@ def train(
             config = load_config(path)
             config.trust = settings.get("trust", [])  # a run directory may be foreign and is not asked
             typed = typed_settings({**named, **settings}, config, "trainer")
-            go_on(path, typed, trust, problem)
+            with _named_when_stopped(path):
+                go_on(path, typed, trust, problem)
         else:
             config, typed = compose_run(experiment, {**named, **settings})
             default = run_folder(config)
             path = own_directory(Path(default).absolute()) if folder is None else Path(folder).absolute()
-            train_new(config, path, typed, trust, problem)
+            with _named_when_stopped(path):
+                train_new(config, path, typed, trust, problem)
     modules = [*named_modules(typed, config.trust), *trust]
     if config.trainer.get("seeds") is not None:
         return [load_run(path / name, modules, problem=problem) for name in member_names(config)]
     return load_run(path, modules, problem=problem)
+
+
+@contextlib.contextmanager
+def _named_when_stopped(folder: Path) -> Iterator[None]:
+    """Let the message of a training that is stopped name its directory."""
+    try:
+        yield
+    except Interrupted as stop:
+        raise Interrupted(stop.update, folder) from None
 
 
 def _subject(subject: Any) -> tuple[str, ReachAvoidProblem | None, dict[str, str], list[str]]:

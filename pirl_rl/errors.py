@@ -71,8 +71,14 @@ class Interrupted(PirlError):
 
     Attributes:
         update: the number of updates that were made.
+
+    Args:
+        update: the same.
+        folder: the run directory, for the message of a call that may not know its name.
     """
 
-    def __init__(self, update: int):
-        super().__init__(f"stopped at update {update}")
+    def __init__(self, update: int, folder: object = None):
+        super().__init__(
+            f"stopped at update {update}" + ("" if folder is None else f"; resume={str(folder)!r} goes on")
+        )
         self.update = update

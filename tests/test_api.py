@@ -13,8 +13,9 @@ import torch
 from small import command
 
 import pirl_rl
+from pirl_rl import api
 from pirl_rl.commands.settings import compose_run
-from pirl_rl.errors import ArgumentError, ConfigError
+from pirl_rl.errors import ArgumentError, ConfigError, Interrupted
 from pirl_rl.problems import Reach1D
 from pirl_rl.run_directory import RunDirectory
 
@@ -299,3 +300,13 @@ def test_every_exported_name_is_there():
     assert {*pirl_rl.__all__} <= {*dir(pirl_rl)}
     with pytest.raises(AttributeError, match="nope"):
         _ = pirl_rl.nope
+
+
+def test_a_training_that_is_stopped_names_its_directory(tmp_path, monkeypatch):
+    def stopped(*arguments):
+        raise Interrupted(7)
+
+    monkeypatch.setattr(api, "train_new", stopped)
+    with pytest.raises(Interrupted, match=r"stopped at update 7; resume='.*run' goes on") as caught:
+        pirl_rl.train("reach1d", folder=tmp_path / "run", **SETTINGS)
+    assert caught.value.update == 7
