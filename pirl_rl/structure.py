@@ -133,13 +133,15 @@ def check_problem(problem: ReachAvoidProblem) -> None:
     few, n = x[:16], problem.states.dim
     _expect_shape(f"{name}.drift", problem.drift(few, u), (16, n))
     sigma = problem.diffusion(few, u)
-    if sigma.ndim != 3:
-        raise ProblemError(f"{name}.diffusion: expected shape (*, {n}, w), got {tuple(sigma.shape)} for 16 states")
+    if sigma.ndim != 3 or sigma.shape[:2] != (16, n):
+        raise ProblemError(
+            f"{name}.diffusion: expected shape (16, {n}, w) for 16 states, with a column for each of w noise channels, "
+            f"got {tuple(sigma.shape)}"
+        )
     if sigma.shape[-1] == 0:
         raise ProblemError(
             f"{name}.diffusion: expected at least one column, got none; without noise it is one of zeros"
         )
-    _expect_shape(f"{name}.diffusion", sigma, (16, n, sigma.shape[-1]))
     for part in ("target_constraints", "avoid_constraints"):
         if getattr(type(problem), part) is not getattr(ReachAvoidProblem, part):
             levels = getattr(problem, part)(few)
