@@ -348,7 +348,7 @@ def test_only_controls_whose_best_value_may_lie_between_their_bounds_have_many_l
     ("arguments", "message"),
     [
         ({"problem": CartPole()}, "problem: expected at most 3 states for a grid, got 4"),
-        ({"problem": Reach1D(), "points": 4}, "points: expected 1 numbers >= 5, or one, got 4"),
+        ({"problem": Reach1D(), "points": 4}, "points: expected an integer >= 5, or one for each of the 1 axes, got 4"),
         ({"problem": Reach1D(), "steps": 1}, "steps: expected a number >= 2, got 1"),
         ({"problem": Reach1D(), "levels": 1}, "levels: expected a number >= 2, got 1"),
         ({"problem": Reach1D(), "margin": [-1.0]}, r"margin: expected 1 numbers >= 0, got \[-1.0\]"),
