@@ -83,7 +83,8 @@ def free_step(
     """
     m = problem.controls.dim
     axes = torch.eye(m, dtype=x.dtype, device=x.device)
-    actions = torch.cat([axes, -axes, axes.new_zeros(1, m), axes.new_ones(1, m), -axes.new_ones(1, m)])
+    corner = axes.new_ones(int(m > 1), m)  # the bounds of a single control are its corners
+    actions = torch.cat([axes, -axes, axes.new_zeros(1, m), corner, -corner])
     u = problem.controls.denormalize(actions.unsqueeze(1).expand(-1, len(x), m))
     sigma = problem.diffusion(x.expand(len(u), -1, -1), u)[..., list(channels)].nan_to_num(0.0)
     levels = [problem.scaled_avoid_level] if problem.has_avoid_set else []

@@ -79,6 +79,6 @@ class Interrupted(PirlError):
 
     def __init__(self, update: int, folder: object = None):
         super().__init__(
-            f"stopped at update {update}" + ("" if folder is None else f"; resume={str(folder)!r} goes on")
+            f"stopped at update {update}" + ("" if folder is None else f"; the run in {folder} can be resumed")
         )
         self.update = update

@@ -23,7 +23,7 @@ FAR = (2.0, 16.0, 128.0, 1_024.0, 8_192.0)
 """Widths of boxes in which levels are asked for their numbers, in widths of `states`; paths may come so far."""
 
 LOG_WIDTH = 0.01
-"""The width of `LogLevels`, as a share of the standard deviation of a level over the box of states."""
+"""The width of `LogLevels`, as a share of the width of a level over the box of states, see `_middle_and_width`."""
 
 QUANTILES, HEAVY = (0.1587, 0.5, 0.8413), 5.0
 """The shares of a normal variable's values below -1, 0 and 1 deviations, and by which factor the deviation of a level
@@ -128,10 +128,11 @@ def _levels(problem: ReachAvoidProblem) -> tuple[Levels, Tensor, Tensor]:
 
 
 def _middle_and_width(sampled: Tensor) -> tuple[Tensor, Tensor]:
-    """The mean and the standard deviation (k,) of levels (N, k) over the box, between which the inputs are [-1, 1].
+    """The middle and the width (k,) of levels (N, k) over the box, by which they are scaled: mean and deviation.
 
-    Where a few values deep in a set are much larger than all others, so that the deviation is that of these alone, they
-    are the median and half the distance of the quantiles that a normal variable has at one deviation.
+    Where a few values deep in a set are much larger than all others, the deviation would be that of these alone. There
+    the middle is the median, and the width is half the distance between the two `QUANTILES` beside it, which is the
+    deviation of a normal variable.
     """
     middle, width = sampled.mean(0), sampled.std(0)
     low, median, high = sampled.quantile(sampled.new_tensor(QUANTILES), dim=0)

@@ -31,8 +31,10 @@ UNIT_STATES, USUAL = 256, (2.0**-20, 2.0**20)
 """The number of random states whose levels show the unit of a level, and the range of sizes that need no other unit."""
 
 COMPARABLE = 8.0
-"""By which factor the levels of one set may vary more than one another without units: the nearest of several faces is
-that of the largest or the smallest level."""
+"""The largest quotient of the deviations of two levels of one set with which the levels are compared as they are.
+
+The nearest of several faces is taken to be that of the largest or the smallest level.
+"""
 
 
 class ReachAvoidProblem(ABC):

@@ -307,6 +307,6 @@ def test_a_training_that_is_stopped_names_its_directory(tmp_path, monkeypatch):
         raise Interrupted(7)
 
     monkeypatch.setattr(api, "train_new", stopped)
-    with pytest.raises(Interrupted, match=r"stopped at update 7; resume='.*run' goes on") as caught:
+    with pytest.raises(Interrupted, match=r"stopped at update 7; the run in .*run can be resumed") as caught:
         pirl_rl.train("reach1d", folder=tmp_path / "run", **SETTINGS)
     assert caught.value.update == 7

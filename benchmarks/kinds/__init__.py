@@ -1,4 +1,4 @@
-"""Problems of other kinds than those of the suite, each written as a user would write it, and with other constants."""
+"""Problems of other kinds than those of the suite, written as a user would, and the suite's with other constants."""
 
 from benchmarks.kinds.approaches import Chain, Pursuit, Rendezvous, Unicycle
 from benchmarks.kinds.compartments import Anaesthesia, HerdImmunity, LotkaVolterra, LynxAndHare, Rooms

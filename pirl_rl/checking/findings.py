@@ -83,7 +83,10 @@ def method_that_raised(error: BaseException, check: str) -> str:
 
 
 def hint(error: str) -> str:
-    """What else to say of an error of torch: that of a function of numpy advises to lose the derivatives."""
+    """A remark on an error of torch that a function of numpy has caused, else nothing.
+
+    What torch itself advises there, `detach`, would lose the derivatives.
+    """
     if not any(sign in error for sign in OF_NUMPY):
         return ""
     return " (physics and levels need functions of torch, such as torch.sin and torch.maximum, and not those of numpy)"
