@@ -18,6 +18,7 @@ from torch import Tensor
 from pirl_rl.arguments import Policy
 from pirl_rl.ascent import Objective, ascend
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.sets import Box
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
 
@@ -146,19 +147,24 @@ def continued_value(solution: Solution, tau: Tensor, x: Tensor) -> Tensor:
     y = x = problem.states.wrap(x)
     failed, reached = problem.failed(x), problem.reached(x)
     if problem.has_avoid_set:
-        y = torch.where(failed.unsqueeze(-1), _mirrored(problem.scaled_avoid_level, x), y)
+        y = torch.where(failed.unsqueeze(-1), _mirrored(problem.scaled_avoid_level, x, problem.states), y)
     if problem.objective == "reach-avoid":
-        y = torch.where(reached.unsqueeze(-1), _mirrored(problem.scaled_reached_level, x), y)
+        y = torch.where(reached.unsqueeze(-1), _mirrored(problem.scaled_reached_level, x, problem.states), y)
     # Networks take one axis of points: stacked critics have an axis of their own before it.
     value = solution.value(tau.flatten(), y.flatten(0, -2)).reshape(tau.shape)
     return torch.where(reached, 2 - value, torch.where(failed, -value, value))
 
 
-def _mirrored(level: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-    """The states (*, n), mirrored at the zero of a level, to first order in the level."""
-    slope = torch.func.grad(lambda y: level(y).sum())(x)
+def _mirrored(level: Callable[[Tensor], Tensor], x: Tensor, states: Box) -> Tensor:
+    """The states (*, n), mirrored at the zero of a level, to first order in the level.
+
+    The mirror image lies along the normal of the face in coordinates in which the box of states is [-1, 1]^n.
+    """
+    half_width = states.center_and_half_width(x)[1]
+    slope = torch.func.grad(lambda y: level(y).sum())(x) * half_width
     # Levels may have any unit: only a slope of 0 leaves a state where it is.
-    return x - 2 * level(x).unsqueeze(-1) * slope / slope.square().sum(-1, keepdim=True).clamp(min=TINY)
+    step = level(x).unsqueeze(-1) * slope / slope.square().sum(-1, keepdim=True).clamp(min=TINY)
+    return x - 2 * half_width * step
 
 
 def value_ahead(

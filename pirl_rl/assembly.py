@@ -17,6 +17,7 @@ from pirl_rl.automatic import (
     choose_paths,
     choose_playing,
     choose_probes,
+    choose_residual_time,
     choose_time_steps,
     choose_updates,
 )
@@ -87,6 +88,7 @@ def choose(config: DictConfig, problem: ReachAvoidProblem) -> str:
     choose_playing(config, problem)
     choose_updates(config, problem)
     choose_paths(config, problem, make_evaluation_simulator(config, problem))
+    choose_residual_time(config, problem)
     return choose_probes(config, problem)
 
 

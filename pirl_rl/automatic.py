@@ -171,6 +171,12 @@ def choose_paths(config: DictConfig, problem: ReachAvoidProblem, simulator: Simu
         config.evaluation.progress.episodes = max(1, episodes // PROGRESS_SHARE)
 
 
+def choose_residual_time(config: DictConfig, problem: ReachAvoidProblem) -> None:
+    """Replace `auto` in loss.hjb_time by the horizon, so that the unit of time does not matter."""
+    if isinstance(config.loss, DictConfig) and config.loss.get("hjb_time") == AUTO:
+        config.loss.hjb_time = float(problem.horizon)
+
+
 def choose_probes(config: DictConfig, problem: ReachAvoidProblem) -> str:
     """Replace `auto` in loss.hjb_probes by a number, and give the reason where the trace is estimated, else ""."""
     # What is no node of settings is refused where the loss is built.

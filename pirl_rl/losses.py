@@ -57,9 +57,12 @@ class PIRLLoss(ScheduledTD3Loss):
         noise_clip: bound of the smoothing noise.
         hjb_noise: standard deviation of the noise on the action of the HJB residual, which biases V low.
         hjb_noise_clip: bound of that noise.
-        hjb_delta: size, in 1/s, beyond which an HJB residual counts linearly (Huber's loss), so that corners where V
-            jumps faster than a network can follow do not outweigh all other points; None squares all residuals, as in
-            the paper.
+        hjb_time: the time, in s, in which an HJB residual is counted: the loss has the squares of hjb_time L^u Q. With
+            one second, as in the paper, the weight of the residual depends on the unit of time; with the horizon it
+            does not.
+        hjb_delta: size beyond which an HJB residual times hjb_time counts linearly (Huber's loss), so that corners
+            where V jumps faster than a network can follow do not outweigh all other points; None squares all residuals,
+            as in the paper.
         hjb_probes: 0 computes the trace of the HJB residual exactly, by one column for each noise channel. A number of
             at least 2 estimates it with so many random vectors at each point, see `pirl_rl.operators`, which costs less
             where there are many channels. Squared residuals and their gradient keep their means; with `hjb_delta`
@@ -91,6 +94,7 @@ class PIRLLoss(ScheduledTD3Loss):
         noise_clip: float = 0.5,
         hjb_noise: float = 0.0,
         hjb_noise_clip: float = 1.0,
+        hjb_time: float = 1.0,
         hjb_delta: float | None = 1.0,
         hjb_probes: int = 0,
         boundary_delta: float | None = None,
@@ -105,7 +109,7 @@ class PIRLLoss(ScheduledTD3Loss):
         td = TemporalDifferences(td_criterion, target_critics, policy_noise, noise_clip)
         if td_criterion == "cross_entropy" and not all(isinstance(critic.layers[-1], nn.Sigmoid) for critic in critics):
             raise ArgumentError("loss.td_criterion: 'cross_entropy' needs critics with output 'Sigmoid'")
-        hjb = HJBResidual(problem, hjb_noise, hjb_noise_clip, hjb_delta, hjb_probes)
+        hjb = HJBResidual(problem, hjb_noise, hjb_noise_clip, hjb_time, hjb_delta, hjb_probes)
         for critic in critics:
             require_twice_differentiable(critic.layers)
         one = torch.ones(problem.controls.dim)

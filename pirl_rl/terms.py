@@ -6,6 +6,7 @@ the critics.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
@@ -96,25 +97,35 @@ class TemporalDifferences:
 
 
 class HJBResidual:
-    """L_PDE: the mean of (L^u Q_i)^2 over unmasked points with u = pi^-(y) + noise, summed over critics.
+    """L_PDE: the mean of (t L^u Q_i)^2 over unmasked points with u = pi^-(y) + noise, summed over critics.
 
     Args:
         problem: the physics.
-        noise, noise_clip, delta, probes: the arguments `hjb_noise`, `hjb_noise_clip`, `hjb_delta` and `hjb_probes` of
-            `pirl_rl.losses.PIRLLoss`.
+        noise, noise_clip, time, delta, probes: the arguments `hjb_noise`, `hjb_noise_clip`, `hjb_time`, `hjb_delta` and
+            `hjb_probes` of `pirl_rl.losses.PIRLLoss`; t is `time`.
 
     Raises:
-        ArgumentError: `probes` is negative or 1.
+        ArgumentError: `time` is not positive, or `probes` is negative or 1.
     """
 
-    def __init__(self, problem: ReachAvoidProblem, noise: float, noise_clip: float, delta: float | None, probes: int):
+    def __init__(
+        self,
+        problem: ReachAvoidProblem,
+        noise: float,
+        noise_clip: float,
+        time: float,
+        delta: float | None,
+        probes: int,
+    ):
+        if not 0 < time < math.inf:
+            raise ArgumentError(f"loss.hjb_time: expected a finite number > 0, in s, or auto, got {time}")
         if probes < 0 or probes == 1:
             raise ArgumentError(
                 "loss.hjb_probes: expected 0 for the exact trace, or at least 2, since the square of a residual needs "
                 f"two independent estimates, got {probes}"
             )
         self.problem, self.channels = problem, noise_channels(problem)
-        self.noise, self.noise_clip, self.delta, self.probes = noise, noise_clip, delta, probes
+        self.noise, self.noise_clip, self.time, self.delta, self.probes = noise, noise_clip, time, delta, probes
 
     def draw(self, x: Tensor) -> dict[str, Tensor]:
         """The noise on the action, and the probes of the trace, for points x (N, n)."""
@@ -141,12 +152,12 @@ class HJBResidual:
     def residuals(
         self, networks: Networks, points: TensorDictBase, action: Tensor, probes: Tensor | None = None
     ) -> Tensor:
-        """L^u Q_i(., action) (critics, N), with the critics' action (N, m) frozen and u = action in physical units.
+        """t L^u Q_i(., action) (critics, N), with the critics' action (N, m) frozen and u = action in physical units.
 
         With probes (k, N, w) there are k estimates of each, (critics, k, N).
         """
         tau, x, u = points["tau"].squeeze(-1), points["state"], self.problem.controls.denormalize(action)
-        return generator(networks.critic.at(action), self.problem, tau, x, u, probes)
+        return self.time * generator(networks.critic.at(action), self.problem, tau, x, u, probes)
 
     def _estimated_squares(
         self, networks: Networks, points: TensorDictBase, action: Tensor, noise: TensorDictBase

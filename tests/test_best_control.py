@@ -163,13 +163,18 @@ class Actuators(ReachAvoidProblem):
         return 100.0 - x[..., 0]
 
 
-def test_each_coordinate_of_the_control_is_judged_with_the_noise_that_depends_on_it():
-    """H is a sum of functions of one coordinate each, so that the best levels are those of the largest generator."""
+@pytest.mark.parametrize("longest", [1.0, 2e-3])
+def test_each_coordinate_of_the_control_is_judged_with_the_noise_that_depends_on_it(longest):
+    """H is a sum of functions of one coordinate each, so that the best levels are those of the largest generator.
+
+    The weights do not fall where the time to go is less than the length of the step.
+    """
     problem = Actuators()
     rule = BestControl(problem, Simulator(problem, 0.01), levels=5, inertia=0.0)
     assert controlled_channels(problem) == [[1], [2], []]
     assert rule.blocks(1) == {(1,): [0], (2,): [1], (): [2]}
     tau, x = points(problem, 50)
+    tau = tau.clamp(max=longest)
     solution, levels = Quadratic(problem), torch.linspace(-1, 1, 5).unsqueeze(-1)
     best, weight = rule._improved(solution, tau, x, torch.zeros(50, 3), levels, 0.0)  # type: ignore[arg-type]
     actions = torch.tensor(list(itertools.product(levels.squeeze(-1).tolist(), repeat=3))).unsqueeze(1)

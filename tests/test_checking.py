@@ -15,6 +15,7 @@ from pirl_rl.checking import check, examine, report
 from pirl_rl.commands.check import main
 from pirl_rl.errors import ProblemError
 from pirl_rl.problems import DoubleIntegrator, DubinsCar, HalfSpace, Pendulum, Reach1D, ZermeloBoat
+from pirl_rl.sets import band
 from pirl_rl.structure import controlled_channels, is_control_affine
 from pirl_rl.switching import switching
 
@@ -215,6 +216,13 @@ class UndeclaredAngle(DubinsCar):
     states = Box(DubinsCar.states.low, DubinsCar.states.high)
 
 
+class AngleOfOneTurn(UndeclaredAngle):
+    """Its target asks for a heading of the box, and does not know that of the next turn."""
+
+    def target_constraints(self, x):
+        return torch.cat([super().target_constraints(x), band(x[..., 2:], 0.0, 1.0)], -1)
+
+
 class NoPeriod(DubinsCar):
     def drift(self, x, u):
         return super().drift(x, u) + x[..., 2:]
@@ -351,6 +359,7 @@ FAULTS = [
     (MoveOfAStep, "warning", "drift", "it uses delta_t"),
     (Milliseconds, "warning", "drift", "in the whole horizon"),
     (UndeclaredAngle, "warning", "states", r"periodic=\[2\]"),
+    (AngleOfOneTurn, "warning", "states", r"drift and noise repeat .* periodic=\[2\]"),
     (NoPeriod, "error", "states", "both ends"),
     (Stiff, "warning", "drift", "ten times as many"),
     (Endless, "error", "horizon", "finite"),

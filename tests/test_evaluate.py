@@ -64,6 +64,9 @@ def test_words_for_false_are_false(run, capsys):
     evaluate.main(few)
     printed = capsys.readouterr().out
     assert "report " not in printed
+    assert "figure " in printed
+    evaluate.main([*few, "figures=no"])
+    assert "figure " not in capsys.readouterr().out
     with pytest.raises(SystemExit):
         evaluate.main([*few, "report=perhaps"])
     assert "report: expected bool, got 'perhaps'" in capsys.readouterr().err

@@ -238,6 +238,27 @@ def test_residuals_beyond_delta_count_linearly():
 
 
 @pytest.mark.usefixtures("float64")
+@pytest.mark.parametrize("probes", [0, 2])
+def test_a_residual_is_counted_in_changes_of_v_within_its_time(probes):
+    """Within t seconds V changes by t times the residual, which counts linearly beyond delta."""
+    problem = FullNoise(3, 1, 2)
+    batch, alone = make_batch(problem), {"weights": (0.0, 1.0, 0.0), "hjb_probes": probes}
+
+    def value(**kwargs):
+        torch.manual_seed(0)
+        return make_loss(problem, **alone, **kwargs).critic_loss(batch)[0]
+
+    assert_close([value(hjb_time=3.0)], [9 * value()])
+    assert_close([value(hjb_time=3.0, hjb_delta=0.6)], [9 * value(hjb_delta=0.2)])
+
+
+@pytest.mark.parametrize("time", [0.0, -1.0, float("inf"), float("nan")])
+def test_a_time_that_is_not_positive_is_refused(time):
+    with pytest.raises(ArgumentError, match=r"loss\.hjb_time: expected a finite number > 0"):
+        make_loss(Reach1D(), hjb_time=time)
+
+
+@pytest.mark.usefixtures("float64")
 def test_errors_on_the_boundary_beyond_delta_count_linearly():
     problem = FullNoise(3, 1, 2)
     batch = make_batch(problem)

@@ -137,6 +137,19 @@ def test_compare_takes_the_members_of_a_population(tmp_path):
     assert [run.get("value_mse") for run in compare.find_runs([tmp_path])["reach1d pirl"]] == [1e-4, 2e-4]
 
 
+def test_compare_keeps_problems_of_ones_own_apart(tmp_path):
+    for seed, target in enumerate(("my_boats.Ferry", "my_boats.Tug", "pirl_rl.problems.Reach1D", "???")):
+        make_run(tmp_path, "pirl", seed)
+        with (tmp_path / f"pirl-{seed}" / ".hydra" / "config.yaml").open("a") as file:
+            file.write(f"env: {{problem: {{_target_: {target}}}}}\n")
+    groups = compare.find_runs([tmp_path])
+    assert {label: len(runs) for label, runs in groups.items()} == {
+        "reach1d Ferry pirl": 1,
+        "reach1d Tug pirl": 1,
+        "reach1d pirl": 2,
+    }
+
+
 def test_compare_draws_median_and_range(runs):
     figure = draw_comparison(compare.find_runs([runs]))
     axes = next(axes for axes in figure.axes if axes.get_title() == "Held-out td_loss")

@@ -273,6 +273,7 @@ def test_resume_refuses(override, told, finished, cli):
     assert code == 1
     assert told in text
     assert "Traceback" not in text
+    assert "from now on" not in text
     assert before == {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()}
 
 

@@ -82,10 +82,11 @@ def test_levels_in_an_extreme_unit_give_the_same_exits_faces_and_weights(unit):
     assert count == other_count == 8_192
 
 
-def test_a_problem_in_other_units_is_learned_alike(tmp_path):
+@pytest.mark.parametrize("method", ["pirl", "pinn"])
+def test_a_problem_in_other_units_is_learned_alike(method, tmp_path):
     """Two batches are collected and twelve updates made; only rounding may differ, in single precision."""
     runs = [
-        pirl_rl.train(problem, folder=tmp_path / name, **SETTINGS)
+        pirl_rl.train(problem, folder=tmp_path / name, method=method, **SETTINGS)
         for name, problem in (("original", DoubleIntegrator()), ("other", InOtherUnits()))
     ]
     rng = torch.Generator().manual_seed(1)
@@ -160,6 +161,37 @@ def test_the_nearest_face_is_that_of_the_shortest_way_and_not_of_the_smallest_le
     lengths = [free_step(problem, outside, [0, 1], 1e-9, 0.1) for problem in (one, other)]
     torch.testing.assert_close(*lengths)
     assert lengths[0].max() < 0.1
+
+
+def test_the_continuation_of_v_does_not_depend_on_the_units_of_the_states():
+    """The faces are oblique, so that a mirror image along the gradient would lie elsewhere in other units."""
+
+    class Oblique(Slab):
+        units = (1.0, 1.0, 1.0, 1.0)
+
+        def target_constraints(self, x):
+            return super().target_constraints(x / torch.tensor(self.units).to(x)) - 0.09
+
+        def avoid_constraints(self, x):
+            return (1.5 - (x / torch.tensor(self.units).to(x))[..., :2].sum(-1)).unsqueeze(-1)
+
+    class Millimetres(Oblique):
+        units = (1.0, 1e3, 1.0, 1e-3)
+        states = Box([-size for size in units], units)
+
+    problem, other = Oblique(), Millimetres()
+    torch.manual_seed(0)
+    actor, critic = Actor(problem, (8,)), Critic(problem, (8, 8), output="Sigmoid")
+    twin = Critic(other, (8, 8), output="Sigmoid")
+    weights = {key: value for key, value in critic.state_dict().items() if key.endswith(("weight", "bias"))}
+    assert not twin.load_state_dict(weights, strict=False).unexpected_keys
+    x = 2 * torch.rand(4_000, 4) - 1
+    inside = x[problem.reached(x) | problem.failed(x)]
+    assert min(problem.reached(x).sum(), problem.failed(x).sum()) > 10
+    tau = torch.full((len(inside),), 0.5)
+    expected = continued_value(Solution(problem, actor, critic), tau, inside)
+    found = continued_value(Solution(other, actor, twin), tau, inside * torch.tensor(other.units))
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
 
 
 def test_a_free_step_sees_noise_that_two_opposite_corners_of_the_controls_do_not_have():

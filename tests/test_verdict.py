@@ -189,6 +189,17 @@ def test_the_advice_where_hardly_a_path_succeeds_fits_the_objective(invariance, 
     assert last.endswith(advice)
 
 
+def test_advice_that_several_reasons_share_is_given_once():
+    measures = dataclasses.replace(
+        GOOD, gap=0.05, over_constant=Difference(0.3, 0.01), ahead=Difference(0.1, 0.01), finer=Difference(0.1, 0.01)
+    )
+    reasons = judge(measures)
+    last = describe(measures, reasons)[-1]
+    assert len(reasons) == 4
+    assert last.count("train") == 3  # longer, from another seed, and trainer.updates
+    assert all(text in last for reason in reasons for text in reason.advice)
+
+
 def test_controls_that_never_move_are_named_and_eight_lines_suffice():
     measures = dataclasses.replace(
         GOOD, still=[0, 2], gap=0.2, over_constant=Difference(0.3, 0.01), value_spread=0.0, gain_at=[0.0] * 9

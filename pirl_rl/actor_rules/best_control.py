@@ -187,7 +187,7 @@ class BestControl(ActorRule):
         if self.steps:
             return value_ahead(solution, self.simulator, tau, x, self.steps, self.flow), dt
         if channels:
-            length = free_step(solution.problem, x, channels, dt, self.longest)
+            length = free_step(solution.problem, x, channels, dt, self.longest).minimum(tau)
             return expected_ahead(solution, tau, x, length, channels), length.unsqueeze(-1)
         return hamiltonian(solution, tau, x, self.controlled_noise and not self.cubature), 1.0
 

@@ -24,8 +24,9 @@ TIME_NAMES = {"dt", "delta_t", "deltat", "sqrt_dt", "time_step", "timestep", "st
 ANGLES = (2 * math.pi, 360.0)
 """Periods of angles, in radians and degrees."""
 
-COVERS = 0.9
-"""The share of a period that a box covers if its coordinate is an angle which may go all the way round."""
+COVERS, ONE_TURN = 0.9, 1.1
+"""The share of a period that a box covers at least if its coordinate is an angle which may go all the way round, and
+that it covers at most if it is one turn wide."""
 
 PART = 0.38
 """A shift by this share of its period changes a function that repeats."""
@@ -109,11 +110,14 @@ def angles(samples: Samples) -> Iterator[Finding]:
             shifted, between = x.clone(), x.clone()
             shifted[:, axis] += period
             between[:, axis] += PART * period
+            # Sets of an angle are often written for the box alone, where that is one turn wide.
+            compared = "drift and noise" if period in ANGLES and width < ONE_TURN * period else "drift, noise and sets"
+            alike = _alike if compared.endswith("sets") else _alike_in_physics
             # Along a coordinate of a much larger scale nothing changes after a part of the period either.
-            if _alike(samples, x, shifted, u) and not _alike(samples, x, between, u):
+            if alike(samples, x, shifted, u) and not alike(samples, x, between, u):
                 message = (
-                    f"drift, noise and sets repeat after {period:.6g} along axis {axis}, which is not periodic; if it "
-                    f"is an angle, write Box(..., periodic=[{axis}]) with a box as wide as its period."
+                    f"{compared} repeat after {period:.6g} along axis {axis}, which is not periodic; if it is an "
+                    f"angle, write Box(..., periodic=[{axis}]) with a box as wide as its period."
                 )
                 yield found(problem, "warning", "states", message)
                 break
@@ -164,9 +168,12 @@ def _physics(samples: Samples, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
 
 def _alike(samples: Samples, x: Tensor, other: Tensor, u: Tensor) -> bool:
     """Whether drift, noise and membership of both sets are the same at the states x and other (N, n)."""
-    problem = samples.problem
+    sets = (samples.problem.reached, samples.problem.failed)
+    return _alike_in_physics(samples, x, other, u) and all(torch.equal(inside(x), inside(other)) for inside in sets)
+
+
+def _alike_in_physics(samples: Samples, x: Tensor, other: Tensor, u: Tensor) -> bool:
+    """Whether drift and noise are the same at the states x and other (N, n)."""
     pairs = zip(_physics(samples, x, u), _physics(samples, other, u), strict=True)
     sizes = ((one, two, float(1 + one.nan_to_num(0.0).abs().max())) for one, two in pairs)
-    rates = all(torch.allclose(one, two, rtol=1e-9, atol=1e-9 * size, equal_nan=True) for one, two, size in sizes)
-    sets = (problem.reached, problem.failed)
-    return rates and all(torch.equal(inside(x), inside(other)) for inside in sets)
+    return all(torch.allclose(one, two, rtol=1e-9, atol=1e-9 * size, equal_nan=True) for one, two, size in sizes)

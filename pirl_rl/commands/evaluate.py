@@ -7,6 +7,7 @@ with the settings of the problem, the simulator and the evaluators, and draws it
 
     run           the directory of a finished run
     verbose=true  prints all metrics with their meaning
+    figures=false leaves out the figures, and report=false the report
     key=value     any setting of the run but those of its networks; evaluation.final lists the evaluators
     trust         modules of your own that the run may import, such as trust=[my_module]
 
@@ -56,6 +57,7 @@ def main(arguments: Sequence[str]) -> None:
         with open_dict(config):
             for name, value in (("verbose", False), ("report", True)):  # older runs have no such settings
                 config.setdefault(name, value)
+            config.figures = True  # whatever the training drew
         for text in overrides:
             if text.partition(".")[0] in TRAINED:
                 raise ConfigError(f"{text}: expected a setting of another group, since the networks are trained")
@@ -74,7 +76,7 @@ def main(arguments: Sequence[str]) -> None:
         settings = {"settings": {name: OmegaConf.to_container(node, resolve=True) for name, node in nodes.items()}}
         with replacing(run.evaluation) as file:
             file.write(json.dumps(statements_of(evidence) | metrics | settings, indent=2) + "\n")
-        figures = draw_run(solution, run.metrics, run.figures, evidence)
+        figures = draw_run(solution, run.metrics, run.figures, evidence) if config.figures else []
     meanings = meanings_of(evaluators, solution.problem)
     print(outcome(lines_of(evidence), metrics, meanings, config.verbose))
     for figure in figures:

@@ -217,7 +217,7 @@ def reopened(
     run, config = RunDirectory(folder), load_config(folder)
     run.refuse_links()
     with locked(run):
-        config.trust = []
+        config.trust, changes = [], []
         for text in overrides:
             if text.startswith("start="):
                 raise ConfigError(f"{text}: the run has begun already; start= is for new runs, without resume=")
@@ -227,12 +227,15 @@ def reopened(
                     f"{text}: a run goes on with the random numbers of its checkpoint, expected the seed {before}"
                 )
             if before != after and not text.startswith("trust="):  # which counts for this command alone
-                print(f"resume: {text.partition('=')[0]} was {before}, and is {after} from now on", flush=True)
+                changes.append(f"resume: {text.partition('=')[0]} was {before}, and is {after} from now on")
         read_switches(config)
         if config.get("grid") is not None:
             raise ConfigError(f"resume: expected a run that was trained, but {folder} holds the solution of a grid")
         modules = [*named_modules(overrides, config.trust), *trust]
-        yield reopen(config, folder, [f"resume={folder.name}", *overrides], modules, problem), config, modules
+        trainer = reopen(config, folder, [f"resume={folder.name}", *overrides], modules, problem)
+        for change in changes:
+            print(change, flush=True)
+        yield trainer, config, modules
 
 
 def _folders(arguments: Sequence[str]) -> list[Path]:

@@ -28,6 +28,8 @@ ERRORS = 3.0
 FLAT, VARIED = 0.01, 0.05
 """Standard deviations over the states: below the first V is constant, above the second success varies."""
 
+TRAIN_LONGER, WIDEN = "train longer (trainer.updates)", "take wider networks (critic.hidden)"
+"""Advice that several reasons share."""
 
 GRID_STATES = 2
 """The largest number of states for which the grid is advised."""
@@ -48,7 +50,7 @@ class Reason(NamedTuple):
 
     level: Literal["doubtful", "failed"]
     why: str
-    advice: str
+    advice: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,8 @@ def judge(m: Measures) -> list[Reason]:
 
 def _failures(m: Measures):
     if not all(number == number for number in (m.success, m.gap, m.value_spread)):
-        yield Reason("failed", "V or the policy is not a number.", "lower learner.learning_rate, and check the problem")
+        advice = "lower learner.learning_rate", "check the problem with python -m pirl_rl.check"
+        yield Reason("failed", "V or the policy is not a number.", advice)
         return
     others = max(m.random, m.constant)
     if m.success == 0 or (m.high < RARE and others >= RARE):
@@ -131,19 +134,19 @@ def _failures(m: Measures):
         yield Reason(
             "failed",
             f"The constant control {control} succeeds more often than the policy, by {m.over_constant.mean:.3f}.",
-            "train longer (trainer.updates) and from another seed",
+            (TRAIN_LONGER, "train from another seed"),
         )
     if m.value_spread < FLAT and m.success_spread > VARIED:
         yield Reason(
             "failed",
             "V is the same at all states, but success is not.",
-            "lower the weights of the HJB residual and of the boundary (pirl.final), or start them later",
+            ("lower the weights of the HJB residual and of the boundary (pirl.final), or start them later",),
         )
     if m.is_wrong(LARGE_GAP):
         yield Reason(
             "failed",
             f"V is wrong by {m.error:.2f} on average, measured by Monte Carlo of its own policy.",
-            "look at figures/calibration.png, and train longer (trainer.updates) or with wider networks",
+            ("look at figures/calibration.png", TRAIN_LONGER, WIDEN),
         )
 
 
@@ -156,19 +159,19 @@ def _doubts(m: Measures):
         yield Reason(
             "doubtful",
             f"V is wrong by {m.error:.3f} on average, and {abs(m.bias.mean):.3f} {sign} Monte Carlo of its own policy.",
-            "train longer (trainer.updates) or with wider networks (critic.hidden)",
+            (TRAIN_LONGER, WIDEN),
         )
     if m.ahead is not None and m.ahead.mean > 0 and m.ahead.matters():
         yield Reason(
             "doubtful",
             f"A policy that looks one control step ahead succeeds more often, by {m.ahead.mean:.3f}.",
-            "train longer, or use run.policy(tau, x, lookahead=1)",
+            (TRAIN_LONGER, "use run.policy(tau, x, lookahead=1)"),
         )
     if m.finer.matters():
         yield Reason(
             "doubtful",
             f"With shorter time steps success changes by {m.finer.mean:+.3f}.",
-            "take a smaller env.dt, or env.dt=auto",
+            ("take a smaller env.dt, or env.dt=auto",),
         )
 
 
@@ -176,12 +179,12 @@ def _event(m: Measures) -> str:
     return "stays out of the avoid set" if m.invariance else "reaches the target"
 
 
-def _look_at_sets(m: Measures) -> str:
+def _look_at_sets(m: Measures) -> tuple[str, ...]:
     """The advice where no path succeeds, or hardly any."""
     wanted = (
         "some control can stay out of the avoid set for the whole horizon" if m.invariance else "the horizon suffices"
     )
-    return f"check the sets with python -m pirl_rl.check, and that {wanted}"
+    return (f"check the sets with python -m pirl_rl.check, and that {wanted}",)
 
 
 def describe(m: Measures, reasons: list[Reason]) -> list[str]:
@@ -206,7 +209,7 @@ def describe(m: Measures, reasons: list[Reason]) -> list[str]:
         names = f"component {m.still[0]}" if len(m.still) == 1 else f"components {', '.join(map(str, m.still))}"
         lines.append(f"control   {names} of the control never move{'s' if len(m.still) == 1 else ''}")
     if reasons:
-        advice = dict.fromkeys(reason.advice for reason in reasons)
+        advice = dict.fromkeys(text for reason in reasons for text in reason.advice)
         if m.states <= GRID_STATES and m.ahead is not None:  # which is not played with the policy of a grid
             advice["or solve it on a grid, which takes seconds (method=grid)"] = None
         lines.append(f"next      {'; '.join(advice)}")

@@ -45,8 +45,8 @@ class Success:
             "success_low": "The lower end of the approximate 95% interval of success_rate (Wilson 1927).",
             "success_high": "The upper end of the approximate 95% interval of success_rate (Wilson 1927).",
             "reward": "The mean payoff of the same episodes, equal to success_rate for the hard payoff.",
-            "value_spread": "The standard deviation of the V of the networks alone, clamped to [0, 1], over the starts "
-            "of the same episodes; it is 0 if V is constant.",
+            "value_spread": "The standard deviation of the V of the networks, or of the grid, clamped to [0, 1], over "
+            "the starts of the same episodes; it is 0 if V is constant.",
         }
         if _optimum_is_known(problem, *_one_point(problem)):
             meanings["optimal_reward"] = "The reward of the optimal control from the same starts, with the same seed."

@@ -17,13 +17,14 @@ import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from pirl_rl.configuration import PACKAGE
 from pirl_rl.errors import RunError
 from pirl_rl.figures.comparison import draw_comparison
 from pirl_rl.figures.files import save_figures
@@ -53,7 +54,7 @@ class RunRecord(NamedTuple):
     """The data of a finished run.
 
     Attributes:
-        label: its group, "experiment method".
+        label: its group, "experiment method", with the class of the problem if that is no problem of the package.
         summary: the entries of summary.json.
         metrics: the columns (rows,) of metrics.csv, by name; none where the run logs nothing, as that of a grid.
     """
@@ -110,6 +111,7 @@ def read_run(path: Path) -> RunRecord:
     try:
         config = OmegaConf.load(run.config)
         names = [OmegaConf.select(config, key, throw_on_missing=True) for key in ("experiment_name", "method_name")]
+        names[1:1] = _own_problem(config)
         summary = run.numbers()
         metrics = read_metrics(run.metrics) if run.metrics.is_file() else {}
     except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException) as error:
@@ -117,6 +119,12 @@ def read_run(path: Path) -> RunRecord:
     if None in names:
         raise RunError(f"{run.config}: expected the keys experiment_name and method_name")
     return RunRecord(" ".join(map(str, names)), summary, metrics)
+
+
+def _own_problem(config: Any) -> list[str]:
+    """The name of the class of a problem of one's own, if a configuration names it."""
+    target = OmegaConf.select(config, "env.problem._target_") or PACKAGE.name
+    return [] if target.partition(".")[0] == PACKAGE.name else [target.rpartition(".")[2]]
 
 
 def comparison_table(groups: dict[str, list[RunRecord]]) -> str:

@@ -83,8 +83,7 @@ class BoundarySampler:
         points, values = self._pool.points, self._pool.values
         if self.problem.faces(1, torch.Generator()) is not None:
             return torch.ones_like(values)
-        parts = zip(points.split(AT_ONCE), values.split(AT_ONCE), strict=True)
-        return torch.cat([face_weights(self.problem, *part) for part in parts])
+        return face_weights(self.problem, points, values)
 
     @cached_property
     def _kept(self) -> dict[tuple[str, torch.device], Any]:
@@ -154,6 +153,13 @@ def face_weights(problem: ReachAvoidProblem, points: Tensor, values: Tensor) -> 
         points: points (K, n) of the faces.
         values: V (K,) there, 1 on the faces of A and 0 on those of B.
     """
+    levels = control_levels(problem)
+    parts = zip(points.split(AT_ONCE), values.split(AT_ONCE), strict=True)
+    return torch.cat([_weights_of_part(problem, *part, levels) for part in parts])
+
+
+def _weights_of_part(problem: ReachAvoidProblem, points: Tensor, values: Tensor, count: int) -> Tensor:
+    """`face_weights` (K,) of a few points, where each coordinate of the control has so many levels."""
     _, half_width = problem.states.center_and_half_width(points)
     normal = torch.nn.functional.normalize(_outward(problem, points, values) * half_width, dim=-1)
     on_target = values > 0.5
@@ -162,7 +168,6 @@ def face_weights(problem: ReachAvoidProblem, points: Tensor, values: Tensor) -> 
         return (problem.drift(points, u) / half_width * normal).sum(-1)
 
     u = problem.controls.denormalize(points.new_zeros(len(points), problem.controls.dim))
-    count = control_levels(problem)
     for axis, (low, high) in enumerate(zip(problem.controls.low, problem.controls.high, strict=True)):
         levels = torch.linspace(low, high, count, dtype=torch.float64).tolist()
         u, *others = (u.index_fill(-1, torch.tensor(axis), level) for level in levels)
