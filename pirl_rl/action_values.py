@@ -10,6 +10,7 @@ functions are the expectation of V after one step with noise, and V some steps a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import torch
@@ -24,6 +25,9 @@ from pirl_rl.solution import Solution
 
 TINY = torch.finfo(torch.float32).tiny
 """The smallest square of a slope that counts."""
+
+FAR = 3.0
+"""The distance from a face, in sqrt(2 h) times the noise across it, from which paths hardly meet it within h."""
 
 CHUNK_ENTRIES = 2**26
 """The largest number of entries of sigma, over all points and actions, that are in memory at once."""
@@ -88,16 +92,41 @@ def free_step(
     actions = torch.cat([axes, -axes, axes.new_zeros(1, m), corner, -corner])
     u = problem.controls.denormalize(actions.unsqueeze(1).expand(-1, len(x), m))
     sigma = problem.diffusion(x.expand(len(u), -1, -1), u)[..., list(channels)].nan_to_num(0.0)
+    length = torch.full_like(x[:, 0], longest)
+    for level, slope in _levels_and_slopes(problem, x):
+        free = level.square() / (4 * len(channels) * _spread(slope, sigma).amax(0)).clamp(min=TINY)
+        length = torch.minimum(length, free.nan_to_num(0.0))  # a level without a number may be that of a near face
+    return length.clamp(min=shortest)
+
+
+def _levels_and_slopes(problem: ReachAvoidProblem, x: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """The levels (N,) of A and B, as far as they absorb, with their gradients (N, n), at states x (N, n)."""
     levels = [problem.scaled_avoid_level] if problem.has_avoid_set else []
     if problem.objective == "reach-avoid":
         levels.append(problem.scaled_reached_level)
-    length = torch.full_like(x[:, 0], longest)
-    for level in levels:
-        slope = torch.func.grad(lambda y, level=level: level(y).sum())(x)
-        spread = (slope.unsqueeze(-1) * sigma).sum(-2).square().sum(-1).amax(0)
-        free = level(x).square() / (4 * len(channels) * spread).clamp(min=TINY)
-        length = torch.minimum(length, free.nan_to_num(0.0))  # a level without a number may be that of a near face
-    return length.clamp(min=shortest)
+    return [(level(x), torch.func.grad(lambda y, level=level: level(y).sum())(x)) for level in levels]
+
+
+def _spread(slope: Tensor, sigma: Tensor) -> Tensor:
+    """|sigma^T grad g|^2 (*, N) for gradients (N, n) of a level g and sigma (*, N, n, w)."""
+    return (slope.unsqueeze(-1) * sigma).sum(-2).square().sum(-1)
+
+
+def time_to_exit(level: Tensor, approach: Tensor, spread: Tensor, h: Tensor) -> Tensor:
+    """The mean time (*, N) until a path meets a face or h has passed, as a share of h, Eq. (exit_share).
+
+    It is that of Brownian motion, or that of the drift alone if this is shorter.
+
+    Args:
+        level: g (N,), the distance from the face to first order.
+        approach: the speed (*, N) at which the drift lowers g.
+        spread: the square (*, N) of the noise of g, per s.
+        h: lengths (N,), in s.
+    """
+    z = (level / (2 * h * spread).clamp(min=TINY).sqrt()).clamp(0, FAR)
+    share = torch.erf(z) * (1 + 2 * z.square()) + 2 * z * ((-z.square()).exp() / math.sqrt(math.pi) - z)
+    by_drift = level / (approach * h).clamp(min=TINY)
+    return torch.minimum(share, by_drift).clamp(0, 1).nan_to_num(1.0)
 
 
 def expected_ahead(
@@ -105,9 +134,11 @@ def expected_ahead(
 ) -> Objective:
     """E V (*, N) after one Euler step with the action (*, N, m), by a cubature of degree three, Eq. (cubature).
 
-    The mean over y = x + f h +- sqrt(w h) sigma_k, for w columns of sigma, has the mean and the covariance of the step.
-    It is bounded where a second derivative is not: next to a face V may change within one step, and there the learned
-    curvature may be of any size and sign. V is continued into A and B, see `continued_value`.
+    The mean over y = x + f r h +- sqrt(w h) sigma_k, for w columns of sigma, has the mean and the covariance of a step
+    that ends in A and B. It is bounded where a second derivative is not: next to a face V may change within one step,
+    and there the learned curvature may be of any size and sign. V is continued into A and B, see `continued_value`,
+    which takes care of the noise. The drift acts until the path meets a face, for the share r of the step, see
+    `time_to_exit`. Otherwise controls beside a face would be chosen for a drift that paths hardly ever feel.
 
     Args:
         solution: gives V, with its values in A and B, and the problem.
@@ -118,14 +149,19 @@ def expected_ahead(
             action adds the same to all actions, to first order in h, and may be left out.
     """
     problem, h = solution.problem, tau.clamp(max=length)
+    faces = _levels_and_slopes(problem, x)
 
     def value(action: Tensor) -> Tensor:
         u, shape = problem.controls.denormalize(action), action.shape[:-1]
         y = x.expand(*shape, -1)
-        columns = problem.diffusion(y, u).movedim(-1, 0)
-        sigma = torch.stack([columns[k] for k in channels])
-        spread = sigma * (len(sigma) * h).sqrt().unsqueeze(-1)
-        ends = y + problem.drift(y, u) * h.unsqueeze(-1) + torch.cat([spread, -spread])
+        drift, diffusion = problem.drift(y, u), problem.diffusion(y, u)
+        duration = h.expand(shape)
+        for level, slope in faces:
+            share = time_to_exit(level, -(slope * drift).sum(-1), _spread(slope, diffusion), h)
+            duration = torch.minimum(duration, share * h)
+        columns = diffusion.movedim(-1, 0)
+        spread = torch.stack([columns[k] for k in channels]) * (len(channels) * h).sqrt().unsqueeze(-1)
+        ends = y + drift * duration.unsqueeze(-1) + torch.cat([spread, -spread])
         return continued_value(solution, (tau - h).expand(ends.shape[:-1]), ends).mean(0)
 
     return value

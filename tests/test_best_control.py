@@ -12,7 +12,7 @@ from torch import Tensor
 
 from benchmarks.kinds import Bicycle, Gusty, Investor, Loiter, Sprint, TwoHarbours
 from pirl_rl import Box, ReachAvoidProblem, action_values
-from pirl_rl.action_values import continued_value, expected_ahead, free_step, hamiltonian, value_ahead
+from pirl_rl.action_values import continued_value, expected_ahead, free_step, hamiltonian, time_to_exit, value_ahead
 from pirl_rl.actor_rules import BestControl, Hamiltonian
 from pirl_rl.ascent import ascend, improved
 from pirl_rl.assembly import make_trainer
@@ -233,6 +233,62 @@ def test_the_continuation_does_not_depend_on_the_unit_of_levels():
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
 
 
+def test_the_time_to_a_face_is_that_of_brownian_motion():
+    """E min(tau, h) is the integral of P(tau > t) = erf(d / (s sqrt(2 t))) over t up to h."""
+    h, distance, spread = torch.tensor(0.3), torch.linspace(1e-3, 3.0, 40, dtype=torch.float64), torch.tensor(1.7)
+    t = (torch.arange(200_000, dtype=torch.float64) + 0.5) * h / 200_000
+    expected = torch.erf(distance.unsqueeze(-1) / (2 * spread * t).sqrt()).mean(-1)
+    found = time_to_exit(distance, torch.zeros(40), spread, h)
+    torch.testing.assert_close(found, expected, atol=2e-5, rtol=0)
+    assert found[-1] > 0.99999
+
+
+def test_the_time_to_a_face_ends_with_the_drift_and_has_no_errors_far_away():
+    far, none = torch.tensor([1e-6, 0.5, 1e6, torch.inf]), torch.zeros(4)
+    one = torch.ones(4)
+    whole = pytest.approx([1.0] * 4, abs=1e-5)
+    assert time_to_exit(far, none, none, one).tolist() == whole
+    assert time_to_exit(far, 2 * one, none, one).tolist() == pytest.approx([5e-7, 0.25, 1.0, 1.0], rel=1e-5)
+    assert time_to_exit(far, -one, 1e-20 * one, one).tolist() == whole
+    assert time_to_exit(torch.full((4,), torch.nan), one, one, one).tolist() == [1.0] * 4
+
+
+class Hurried(Channel):
+    """Noise of 0.2 to 1 and a drift of up to 0.5 to the target, both of which grow with the control."""
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.cat([u / 2, torch.zeros_like(u)], -1)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return (0.2 + 0.8 * u[..., None]) * torch.eye(2).to(x)
+
+
+def test_a_step_beside_a_face_is_that_of_paths_that_stop_there():
+    """V = 1 - d at the distance d from the target, and the mean over paths that are held there, by simulation."""
+
+    class Linear(Straight):
+        problem = Hurried()
+
+        def value(self, tau: Tensor, x: Tensor) -> Tensor:
+            return x[..., 0]
+
+    h, steps, paths = 0.01, 400, 20_000
+    rng = torch.Generator().manual_seed(0)
+    for distance, action in itertools.product((0.003, 0.02, 0.1), (-0.5, 1.0)):
+        x, u = torch.tensor([[1 - distance, 0.0]]), Hurried.controls.denormalize(torch.tensor([[action]]))
+        found = expected_ahead(Linear(), torch.ones(1), x, h, [0, 1])(torch.tensor([[action]]))  # type: ignore[arg-type]
+        y, alive = torch.full((paths,), 1 - distance), torch.ones(paths, dtype=torch.bool)
+        spread = Hurried().diffusion(x, u)[0, 0, 0]
+        for _ in range(steps):
+            move = u[0, 0] / 2 * h / steps + spread * (h / steps) ** 0.5 * torch.randn(paths, generator=rng)
+            # The bridge between two points meets the face with this probability.
+            meets = torch.exp(-2 * (1 - y) * (1 - y - move) / (spread**2 * h / steps)).clamp(max=1)
+            hit = alive & (torch.rand(paths, generator=rng) < meets)
+            y, alive = torch.where(hit, 1.0, torch.where(alive, y + move, y)), alive & ~hit
+        error = (y - found).std() / paths**0.5
+        assert abs(y.mean() - found) < 4 * error + 1e-5, (distance, action)
+
+
 class Straight:
     """V = (1 + x_1)/2 between the sets, where noise neither helps nor harms: V is a martingale for any of it."""
 
@@ -301,7 +357,13 @@ def test_several_actions_at_once_have_the_values_of_each_of_them_beside_faces(cr
     objective = expected_ahead(solution, tau, x, 0.05, [0, 1])
     found, u, h = objective(actions), problem.controls.denormalize(actions), 0.05
     for i, j in itertools.product(range(3), range(2)):
-        mean, sigma = x + h * problem.drift(x, u[i, j]), problem.diffusion(x, u[i, j])
+        drift, sigma, duration = problem.drift(x, u[i, j]), problem.diffusion(x, u[i, j]), torch.full_like(tau, h)
+        for level in (problem.avoid_level, problem.target_level):
+            slope = torch.func.grad(lambda y, level=level: level(y).sum())(x)
+            spread = torch.einsum("ni,nik->nk", slope, sigma).square().sum(-1)
+            share = time_to_exit(level(x), -(slope * drift).sum(-1), spread, torch.full_like(tau, h))
+            duration = torch.minimum(duration, h * share)
+        mean = x + duration.unsqueeze(-1) * drift
         ends = [mean + side * math.sqrt(2 * h) * sigma[..., k] for k in range(2) for side in (1, -1)]
         expected = torch.stack([continued_value(solution, tau - h, end) for end in ends]).mean(0)
         assert torch.allclose(found[i, j], expected, atol=1e-6)

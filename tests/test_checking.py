@@ -219,8 +219,8 @@ class UndeclaredAngle(DubinsCar):
 class AngleOfOneTurn(UndeclaredAngle):
     """Its target asks for a heading of the box, and does not know that of the next turn."""
 
-    def target_constraints(self, x):
-        return torch.cat([super().target_constraints(x), band(x[..., 2:], 0.0, 1.0)], -1)
+    def target_level(self, x):
+        return torch.maximum(super().target_level(x), band(x[..., 2], 0.0, 1.0))
 
 
 class NoPeriod(DubinsCar):

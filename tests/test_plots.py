@@ -141,7 +141,7 @@ def test_compare_keeps_problems_of_ones_own_apart(tmp_path):
     for seed, target in enumerate(("my_boats.Ferry", "my_boats.Tug", "pirl_rl.problems.Reach1D", "???")):
         make_run(tmp_path, "pirl", seed)
         with (tmp_path / f"pirl-{seed}" / ".hydra" / "config.yaml").open("a") as file:
-            file.write(f"env: {{problem: {{_target_: {target}}}}}\n")
+            file.write(f"env: {{problem: {{_target_: '{target}'}}}}\n")
     groups = compare.find_runs([tmp_path])
     assert {label: len(runs) for label, runs in groups.items()} == {
         "reach1d Ferry pirl": 1,

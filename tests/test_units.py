@@ -170,7 +170,7 @@ def test_the_continuation_of_v_does_not_depend_on_the_units_of_the_states():
         units = (1.0, 1.0, 1.0, 1.0)
 
         def target_constraints(self, x):
-            return super().target_constraints(x / torch.tensor(self.units).to(x)) - 0.09
+            return super().target_constraints(x / torch.tensor(self.units).to(x)) - 0.29
 
         def avoid_constraints(self, x):
             return (1.5 - (x / torch.tensor(self.units).to(x))[..., :2].sum(-1)).unsqueeze(-1)
