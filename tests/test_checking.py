@@ -359,7 +359,7 @@ FAULTS = [
     (MoveOfAStep, "warning", "drift", "it uses delta_t"),
     (Milliseconds, "warning", "drift", "in the whole horizon"),
     (UndeclaredAngle, "warning", "states", r"periodic=\[2\]"),
-    (AngleOfOneTurn, "warning", "states", r"drift and noise repeat .* periodic=\[2\]"),
+    (AngleOfOneTurn, "note", "states", r"drift and noise repeat .* periodic=\[2\]"),
     (NoPeriod, "error", "states", "both ends"),
     (Stiff, "warning", "drift", "ten times as many"),
     (Endless, "error", "horizon", "finite"),

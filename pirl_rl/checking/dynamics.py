@@ -110,16 +110,20 @@ def angles(samples: Samples) -> Iterator[Finding]:
             shifted, between = x.clone(), x.clone()
             shifted[:, axis] += period
             between[:, axis] += PART * period
-            # Sets of an angle are often written for the box alone, where that is one turn wide.
-            compared = "drift and noise" if period in ANGLES and width < ONE_TURN * period else "drift, noise and sets"
-            alike = _alike if compared.endswith("sets") else _alike_in_physics
             # Along a coordinate of a much larger scale nothing changes after a part of the period either.
-            if alike(samples, x, shifted, u) and not alike(samples, x, between, u):
+            whole, physics = (
+                alike(samples, x, shifted, u) and not alike(samples, x, between, u)
+                for alike in (_alike, _alike_in_physics)
+            )
+            # Sets of an angle are often written for the box alone, where that is one turn wide.
+            one_turn = physics and period in ANGLES and width < ONE_TURN * period
+            if whole or one_turn:
+                what = "drift, noise and sets" if whole else "drift and noise"
                 message = (
-                    f"{compared} repeat after {period:.6g} along axis {axis}, which is not periodic; if it is an "
-                    f"angle, write Box(..., periodic=[{axis}]) with a box as wide as its period."
+                    f"{what} repeat after {period:.6g} along axis {axis}, which is not periodic; if it is an angle, "
+                    f"write Box(..., periodic=[{axis}]) with a box as wide as its period."
                 )
-                yield found(problem, "warning", "states", message)
+                yield found(problem, "warning" if whole else "note", "states", message)
                 break
 
 
