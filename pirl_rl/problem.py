@@ -11,9 +11,8 @@ the physics is written down; networks, environments and integration are elsewher
 from __future__ import annotations
 
 import copy
-import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import ClassVar, Literal
 
@@ -22,19 +21,10 @@ from torch import Tensor
 
 from pirl_rl.errors import ProblemError
 from pirl_rl.payoffs import Indicator, Payoff
-from pirl_rl.sets import Box, Plane
+from pirl_rl.sets import Box, Plane, in_units, units_of_levels
 
 RANDOM_STATES, WIDER = 100_000, 1.5
 """The number of random states at which A and B are compared, and by which factor their box is wider than `states`."""
-
-UNIT_STATES, USUAL = 256, (2.0**-20, 2.0**20)
-"""The number of random states whose levels show the unit of a level, and the range of sizes that need no other unit."""
-
-COMPARABLE = 8.0
-"""The largest quotient of the deviations of two levels of one set with which the levels are compared as they are.
-
-The nearest of several faces is taken to be that of the largest or the smallest level.
-"""
 
 
 class ReachAvoidProblem(ABC):
@@ -197,7 +187,7 @@ class ReachAvoidProblem(ABC):
         With it single precision has the squares of the levels, and the levels vary about as much as one another, so
         that they can be compared. The powers are 1 where levels have a usual size and are alike.
         """
-        return _divided(self.reached_constraints(x), self._reached_units)
+        return in_units(self.reached_constraints(x), self._reached_units)
 
     def scaled_reached_level(self, x: Tensor) -> Tensor:
         """The level (*) of the set that absorbs with success, in the same units."""
@@ -205,7 +195,7 @@ class ReachAvoidProblem(ABC):
 
     def scaled_avoid_constraints(self, x: Tensor) -> Tensor:
         """`avoid_constraints` (*, k), each divided by a power of two, see `scaled_reached_constraints`."""
-        return _divided(self.avoid_constraints(x), self._avoid_units)
+        return in_units(self.avoid_constraints(x), self._avoid_units)
 
     def scaled_avoid_level(self, x: Tensor) -> Tensor:
         """`avoid_level` (*) in the same units."""
@@ -213,11 +203,11 @@ class ReachAvoidProblem(ABC):
 
     @cached_property
     def _reached_units(self) -> list[float]:
-        return _units(self.reached_constraints, self.states)
+        return units_of_levels(self.reached_constraints, self.states)
 
     @cached_property
     def _avoid_units(self) -> list[float]:
-        return _units(self.avoid_constraints, self.states)
+        return units_of_levels(self.avoid_constraints, self.states)
 
     def reached(self, x: Tensor) -> Tensor:
         """Whether states (*, n) are absorbed with success, (*) bool; never in an invariance problem."""
@@ -259,29 +249,6 @@ def with_indicator(problem: ReachAvoidProblem) -> ReachAvoidProblem:
     hard.payoff = Indicator()
     vars(hard).pop("_reached_units", None)  # they belong to the set of the payoff
     return hard
-
-
-def _units(levels: Callable[[Tensor], Tensor], states: Box) -> list[float]:
-    """Powers of two by which levels (*, k) are divided, or none where all have a usual size and vary alike.
-
-    A level has the size of its median absolute deviation over the box, or of its median where it hardly varies.
-    """
-    sampled = levels(states.sample(UNIT_STATES, torch.Generator().manual_seed(0), torch.float64))
-    sampled = torch.where(sampled.isfinite(), sampled, torch.nan)
-    deviation = (sampled - sampled.nanmedian(0).values).abs().nanmedian(0).values
-    size = torch.where(deviation > 0, deviation, sampled.abs().nanmedian(0).values)
-    known = size[size > 0]
-    usual = ((known >= USUAL[0]) & (known <= USUAL[1])).all()
-    if not len(known) or (usual and known.amax() <= COMPARABLE * known.amin()):
-        return []
-    return [2.0 ** math.frexp(one)[1] if one > 0 else 1.0 for one in size.tolist()]
-
-
-def _divided(levels: Tensor, units: Sequence[float]) -> Tensor:
-    """The levels (*, k) in their units, if there are any."""
-    if not units:
-        return levels
-    return torch.stack([one / unit for one, unit in zip(levels.unbind(-1), units, strict=True)], -1)
 
 
 def _normalized(levels, x: Tensor) -> Tensor:

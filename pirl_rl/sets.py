@@ -1,7 +1,8 @@
 """Boxes and the algebra of level sets.
 
 A closed set S is described by a level function g with S = {x : g(x) <= 0}. This one function gives membership,
-crossings of the boundary between two time steps, and contours. The level of states (*, n) has shape (*).
+crossings of the boundary between two time steps, and contours. The level of states (*, n) has shape (*). Levels that
+are compared with each other are counted in units of their own size first.
 """
 
 from __future__ import annotations
@@ -14,6 +15,15 @@ import torch
 from torch import Tensor
 
 from pirl_rl.errors import ArgumentError
+
+UNIT_STATES, USUAL = 256, (2.0**-20, 2.0**20)
+"""The number of random states whose levels show the unit of a level, and the range of sizes that need no other unit."""
+
+COMPARABLE = 8.0
+"""The largest quotient of the deviations of two levels of one set with which the levels are compared as they are.
+
+The nearest of several faces is taken to be that of the largest or the smallest level.
+"""
 
 
 class Box:
@@ -192,3 +202,35 @@ def difference(level: Tensor, other: Tensor) -> Tensor:
 def band(value: Tensor, center: Tensor | float, half_width: float) -> Tensor:
     """The level (*) of the set {|value - center| <= half_width}."""
     return (value - center).abs() - half_width
+
+
+def units_of_levels(levels: Callable[[Tensor], Tensor], states: Box) -> list[float]:
+    """Powers of two by which levels (*, k) are divided, or none where all have a usual size and vary alike.
+
+    A level has the size of its median absolute deviation over the box, or of its median where it hardly varies.
+
+    Args:
+        levels: maps states (*, n) to the levels (*, k) of one set.
+        states: the box of states.
+    """
+    sampled = levels(states.sample(UNIT_STATES, torch.Generator().manual_seed(0), torch.float64))
+    sampled = torch.where(sampled.isfinite(), sampled, torch.nan)
+    deviation = (sampled - sampled.nanmedian(0).values).abs().nanmedian(0).values
+    size = torch.where(deviation > 0, deviation, sampled.abs().nanmedian(0).values)
+    known = size[size > 0]
+    usual = ((known >= USUAL[0]) & (known <= USUAL[1])).all()
+    if not len(known) or (usual and known.amax() <= COMPARABLE * known.amin()):
+        return []
+    return [2.0 ** math.frexp(one)[1] if one > 0 else 1.0 for one in size.tolist()]
+
+
+def in_units(levels: Tensor, units: Sequence[float]) -> Tensor:
+    """The levels (*, k), each divided by its unit, or as they are where there are no units.
+
+    Args:
+        levels: (*, k).
+        units: k numbers or none, see `units_of_levels`.
+    """
+    if not units:
+        return levels
+    return torch.stack([one / unit for one, unit in zip(levels.unbind(-1), units, strict=True)], -1)
