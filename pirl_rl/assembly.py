@@ -83,7 +83,7 @@ def make_problem(config: DictConfig, trust: Sequence[str] = ()) -> ReachAvoidPro
 
 
 def choose(config: DictConfig, problem: ReachAvoidProblem) -> str:
-    """Replace the settings `auto` of time steps, updates and paths; says why the trace is estimated, if it is."""
+    """Replace the settings `auto` that depend on the problem; says why the trace is estimated, if it is."""
     choose_time_steps(config, problem)
     choose_playing(config, problem)
     choose_updates(config, problem)

@@ -19,7 +19,7 @@ AUTO = "auto"
 """The value that leaves a choice to the package.
 
 Keys that take it: env.dt, env.substeps, env.num_envs, collector.n_steps, n_steps of a stage, trainer.updates,
-actor.choices, actor.together, loss.hjb_probes and the entries of `PATHS`.
+actor.choices, actor.together, loss.hjb_time, loss.hjb_probes and the entries of `PATHS`.
 """
 
 UPDATES_PER_DIMENSION, FEW_STATES, UPDATES_OF_MANY = 2_300, 3, 2_900
