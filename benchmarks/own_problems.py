@@ -1,9 +1,10 @@
 """The default recipe on problems of other kinds than those of the suite, against the grid.
 
-    python benchmarks/own_problems.py [NAME ...] [--seed 50] [--settings KEY=VALUE ...] [--out FOLDER] [--json FILE]
+    python benchmarks/own_problems.py [NAME ...] [--seed 50] [--states 31000] [--rollouts 1000]
+        [--settings KEY=VALUE ...] [--out FOLDER] [--json FILE]
 
 docs/suite.md says which of the problems had a part in choices, and in which. V and the success of the learned policy
-are compared with the grid, in the way of the suite, at 400 states with 1,000 paths from each. There is no truth with
+are compared with the grid, in the way of the suite, at 400 states, which `--states` draws. There is no truth with
 three states and two controls, or with more states. Bearing and Mirror are exceptions: they are compared with the
 products of the grids of their independent subsystems. A run takes minutes. A finished run is loaded and not trained
 again, so that other settings need another folder.
@@ -30,15 +31,12 @@ from pirl_rl.scoring.truth import EARLIEST
 POINTS = {1: 801, 2: 161, 3: 81}
 """The nodes of the grid along each axis, by the number of states."""
 
-STATES, ROLLOUTS = 400, 1_000
-
-STATES_SEED = 31_000
-"""The seed of the states at which runs are measured; no training uses it."""
+STATES = 400
 
 
-def truth_by_parts(problem: Mixture) -> Truth:
+def truth_by_parts(problem: Mixture, seed: int) -> Truth:
     """The reference values of a mixture: V is the product of those that the grid has for its subsystems."""
-    rng = torch.Generator().manual_seed(STATES_SEED)
+    rng = torch.Generator().manual_seed(seed)
     x = sample_interior(problem, problem.states, STATES, rng, torch.float64)
     tau = problem.horizon * (EARLIEST + (1 - EARLIEST) * torch.rand(len(x), generator=rng, dtype=x.dtype))
     value, error = torch.ones_like(tau), 0.0
@@ -49,23 +47,28 @@ def truth_by_parts(problem: Mixture) -> Truth:
     return Truth(tau, x, value, "grid", error)
 
 
-def measured(name: str, seed: int, out: Path, settings: dict) -> Score:
+def measured(name: str, arguments: argparse.Namespace, settings: dict) -> Score:
     """Train a problem, or load its finished run, and compare it with the grid."""
-    problem, folder = PROBLEMS[name](), out / f"{name}-{seed}"
-    truth = (
-        truth_by_parts(problem) if isinstance(problem, Mixture) else find_truth(problem, STATES, STATES_SEED, POINTS)
-    )
+    problem, seed = PROBLEMS[name](), arguments.seed
+    folder = arguments.out / f"{name}-{seed}"
+    if isinstance(problem, Mixture):
+        truth = truth_by_parts(problem, arguments.states)
+    else:
+        truth = find_truth(problem, STATES, arguments.states, POINTS)
     if not (folder / "summary.json").exists():
         pirl_rl.train(problem, folder=folder, seed=seed, report=False, **{"evaluation.during": []}, **settings)
     run = pirl_rl.load_run(folder, problem=problem)
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    return measure(run.solution, run.simulator, truth, ROLLOUTS, summary["wall_seconds"], int(summary["updates"]))
+    seconds, updates = summary["wall_seconds"], int(summary["updates"])
+    return measure(run.solution, run.simulator, truth, arguments.rollouts, seconds, updates)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(PROBLEMS)}; all by default")
-    parser.add_argument("--seed", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=50, help="of the trainings")
+    parser.add_argument("--states", type=int, default=31_000, help="seed of the states; no training uses it")
+    parser.add_argument("--rollouts", type=int, default=1_000, help="paths from each state")
     parser.add_argument("--settings", nargs="*", default=[], metavar="KEY=VALUE", help="of all trainings")
     parser.add_argument("--out", type=Path, default=Path("runs/own_problems"))
     parser.add_argument("--json", type=Path)
@@ -73,9 +76,10 @@ def main() -> None:
     if unknown := {*arguments.names} - PROBLEMS.keys():
         parser.error(f"expected names out of {', '.join(PROBLEMS)}, got {', '.join(sorted(unknown))}")
     settings = {key: yaml.safe_load(value) for key, _, value in (text.partition("=") for text in arguments.settings)}
-    scores = {name: measured(name, arguments.seed, arguments.out, settings) for name in arguments.names or PROBLEMS}
+    scores = {name: measured(name, arguments, settings) for name in arguments.names or PROBLEMS}
     found = {name: asdict(score) for name, score in scores.items()}
-    save(arguments.json, {}, seed=arguments.seed, settings=settings, problems=found)
+    asked = {key: getattr(arguments, key) for key in ("seed", "states", "rollouts")}
+    save(arguments.json, {}, **asked, settings=settings, problems=found)
     print(markdown({name: [score] for name, score in scores.items()}, dict.fromkeys(scores, "grid")))
     print(f"\nThe standard error of each loss is at most {max(score.loss_error for score in scores.values()):.4f}.")
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -70,8 +71,28 @@ def _bend(problem: ReachAvoidProblem, x: Tensor, u: Tensor, curvature: Tensor) -
     return (sigma * (curvature @ sigma)).sum((-2, -1)) / 2
 
 
+class Face(NamedTuple):
+    """The level g (N,) of a set that absorbs, with its gradient (N, n), at states (N, n)."""
+
+    level: Tensor
+    slope: Tensor
+
+
+def absorbing_faces(problem: ReachAvoidProblem, x: Tensor) -> list[Face]:
+    """The levels of A and B, as far as they absorb, at states x (N, n)."""
+    levels = [problem.scaled_avoid_level] if problem.has_avoid_set else []
+    if problem.objective == "reach-avoid":
+        levels.append(problem.scaled_reached_level)
+    return [Face(level(x), torch.func.grad(lambda y, level=level: level(y).sum())(x)) for level in levels]
+
+
 def free_step(
-    problem: ReachAvoidProblem, x: Tensor, channels: Sequence[int], shortest: float, longest: float
+    problem: ReachAvoidProblem,
+    x: Tensor,
+    faces: Sequence[Face],
+    channels: Sequence[int],
+    shortest: float,
+    longest: float,
 ) -> Tensor:
     """The length (N,) in s, between two bounds, of an Euler step whose noise goes at most half way to A and to B.
 
@@ -83,6 +104,7 @@ def free_step(
     Args:
         problem: the physics.
         x: states (N, n).
+        faces: those at x, see `absorbing_faces`.
         channels: the w columns of sigma that count, at least one.
         shortest, longest: the bounds of the length, in s.
     """
@@ -93,18 +115,10 @@ def free_step(
     u = problem.controls.denormalize(actions.unsqueeze(1).expand(-1, len(x), m))
     sigma = problem.diffusion(x.expand(len(u), -1, -1), u)[..., list(channels)].nan_to_num(0.0)
     length = torch.full_like(x[:, 0], longest)
-    for level, slope in _levels_and_slopes(problem, x):
+    for level, slope in faces:
         free = level.square() / (4 * len(channels) * _spread(slope, sigma).amax(0)).clamp(min=TINY)
         length = torch.minimum(length, free.nan_to_num(0.0))  # a level without a number may be that of a near face
     return length.clamp(min=shortest)
-
-
-def _levels_and_slopes(problem: ReachAvoidProblem, x: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """The levels (N,) of A and B, as far as they absorb, with their gradients (N, n), at states x (N, n)."""
-    levels = [problem.scaled_avoid_level] if problem.has_avoid_set else []
-    if problem.objective == "reach-avoid":
-        levels.append(problem.scaled_reached_level)
-    return [(level(x), torch.func.grad(lambda y, level=level: level(y).sum())(x)) for level in levels]
 
 
 def _spread(slope: Tensor, sigma: Tensor) -> Tensor:
@@ -130,7 +144,12 @@ def time_to_exit(level: Tensor, approach: Tensor, spread: Tensor, h: Tensor) -> 
 
 
 def expected_ahead(
-    solution: Solution, tau: Tensor, x: Tensor, length: float | Tensor, channels: Sequence[int]
+    solution: Solution,
+    tau: Tensor,
+    x: Tensor,
+    faces: Sequence[Face],
+    length: float | Tensor,
+    channels: Sequence[int],
 ) -> Objective:
     """E V (*, N) after one Euler step with the action (*, N, m), by a cubature of degree three, Eq. (cubature).
 
@@ -144,12 +163,12 @@ def expected_ahead(
         solution: gives V, with its values in A and B, and the problem.
         tau: times to go (N,), in s.
         x: states (N, n).
+        faces: those at x, see `absorbing_faces`.
         length: h in s, one number or those of all states (N,); it is shortened to tau.
         channels: the w columns of sigma that count, at least one. The effect of a column that does not depend on the
             action adds the same to all actions, to first order in h, and may be left out.
     """
     problem, h = solution.problem, tau.clamp(max=length)
-    faces = _levels_and_slopes(problem, x)
 
     def value(action: Tensor) -> Tensor:
         u, shape = problem.controls.denormalize(action), action.shape[:-1]

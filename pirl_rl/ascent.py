@@ -59,10 +59,11 @@ def improved(
     take the place of coordinates where the levels are combinations of theirs.
 
     Inertia decides between levels that are nearly as good as each other: from an action to each level, the objective
-    loses this share of its range over the levels for each unit of their distance, which is the largest of those of the
+    loses this share of its range between the two for each unit of their distance, which is the largest of those of the
     coordinates in a group. Between the two maxima of a function whose minimum lies in the middle, an action then goes
-    to one and stays there. Where the objective is affine in a coordinate, the best of two bounds stays the best with
-    any inertia below 1/2.
+    to one and stays there. A level that is much worse than the action and than the level under trial, and does not lie
+    between them, does not hold the action back. Where the objective is affine in a coordinate, the best of two bounds
+    stays the best with any inertia of at most 1/4.
 
     Args:
         objective: the function to maximise, for actions (*, N, m).
@@ -121,9 +122,23 @@ def _preferred(values: Tensor, before: Tensor, options: Tensor, parts: Tensor, i
         parts: the coordinates of the given action (groups, N, s).
         inertia: see `improved`.
     """
-    stakes = torch.maximum(values.amax(1), before) - torch.minimum(values.amin(1), before)
     distance = (options - parts.unsqueeze(1)).abs().amax(-1)
-    return (values - inertia * stakes.unsqueeze(1) * distance).argmax(1), stakes
+    penalty = inertia * distance * _ranges_between(values, before, options, parts)
+    stakes = torch.maximum(values.amax(1), before) - torch.minimum(values.amin(1), before)
+    return (values - penalty).argmax(1), stakes
+
+
+def _ranges_between(values: Tensor, before: Tensor, options: Tensor, parts: Tensor) -> Tensor:
+    """The range of the objective (groups, k, N) from the given action to each option; see `_preferred`.
+
+    It is that over both and over all options in the box that has them as opposite corners.
+    """
+    given = parts.unsqueeze(1)
+    low, high = (bound.unsqueeze(2) for bound in (torch.minimum(options, given), torch.maximum(options, given)))
+    passed = options.unsqueeze(1)
+    beside = ~((low <= passed) & (passed <= high)).all(-1)  # (groups, k, k, N)
+    top, bottom = (values.unsqueeze(1).masked_fill(beside, far) for far in (-torch.inf, torch.inf))
+    return torch.maximum(top.amax(2), before) - torch.minimum(bottom.amin(2), before)
 
 
 def replaced(action: Tensor, column: int, level: Tensor | float) -> Tensor:

@@ -12,7 +12,15 @@ from torch import Tensor
 
 from benchmarks.kinds import Bicycle, Gusty, Investor, Loiter, Sprint, TwoHarbours
 from pirl_rl import Box, ReachAvoidProblem, action_values
-from pirl_rl.action_values import continued_value, expected_ahead, free_step, hamiltonian, time_to_exit, value_ahead
+from pirl_rl.action_values import (
+    absorbing_faces,
+    continued_value,
+    expected_ahead,
+    free_step,
+    hamiltonian,
+    time_to_exit,
+    value_ahead,
+)
 from pirl_rl.actor_rules import BestControl, Hamiltonian
 from pirl_rl.ascent import ascend, improved
 from pirl_rl.assembly import make_trainer
@@ -138,7 +146,9 @@ def test_the_cubature_is_exact_for_a_quadratic_value():
     mean, sigma = y + problem.drift(y, u) * h.unsqueeze(-1), problem.diffusion(y, u)
     trace = (sigma * (Quadratic.M @ sigma)).sum((-2, -1))
     expected = Quadratic(problem).value(tau - h, mean) + h * trace / 2
-    found = expected_ahead(Quadratic(problem), tau, x, 0.3, range(sigma.shape[-1]))(action)  # type: ignore[arg-type]
+    faces = absorbing_faces(problem, x)
+    objective = expected_ahead(Quadratic(problem), tau, x, faces, 0.3, range(sigma.shape[-1]))  # type: ignore[arg-type]
+    found = objective(action)
     assert torch.allclose(found, expected, atol=1e-5)
 
 
@@ -276,7 +286,9 @@ def test_a_step_beside_a_face_is_that_of_paths_that_stop_there():
     rng = torch.Generator().manual_seed(0)
     for distance, action in itertools.product((0.003, 0.02, 0.1), (-0.5, 1.0)):
         x, u = torch.tensor([[1 - distance, 0.0]]), Hurried.controls.denormalize(torch.tensor([[action]]))
-        found = expected_ahead(Linear(), torch.ones(1), x, h, [0, 1])(torch.tensor([[action]]))  # type: ignore[arg-type]
+        faces = absorbing_faces(Hurried(), x)
+        objective = expected_ahead(Linear(), torch.ones(1), x, faces, h, [0, 1])  # type: ignore[arg-type]
+        found = objective(torch.tensor([[action]]))
         y, alive = torch.full((paths,), 1 - distance), torch.ones(paths, dtype=torch.bool)
         spread = Hurried().diffusion(x, u)[0, 0, 0]
         for _ in range(steps):
@@ -301,7 +313,8 @@ class Straight:
 def test_noise_beside_a_face_is_not_preferred():
     """Without the continuation into B, a path that crosses its face could return, and noise would seem to help."""
     x = torch.tensor([[-0.999, 0.0], [-0.95, 0.3], [0.0, 0.0], [0.95, 0.3], [0.999, 0.0]])
-    objective = expected_ahead(Straight(), torch.ones(5), x, 0.05, [0, 1])  # type: ignore[arg-type]
+    faces = absorbing_faces(Channel(), x)
+    objective = expected_ahead(Straight(), torch.ones(5), x, faces, 0.05, [0, 1])  # type: ignore[arg-type]
     still, noisy = (objective(torch.full((5, 1), action)) for action in (-1.0, 1.0))
     assert torch.allclose(still, noisy, atol=1e-6)
 
@@ -309,12 +322,13 @@ def test_noise_beside_a_face_is_not_preferred():
 def test_a_free_step_goes_half_way_to_the_faces():
     """Two channels of strength 1, which h moves by sqrt(2 h), and levels of any slope; see `free_step`."""
     x = Channel().states.sample(200, torch.Generator().manual_seed(3))
-    distance = 1 - x[:, 0].abs()
-    found = free_step(Channel(), x, [0, 1], 1e-3, 0.05)
+    distance, faces = 1 - x[:, 0].abs(), absorbing_faces(Channel(), x)
+    found = free_step(Channel(), x, faces, [0, 1], 1e-3, 0.05)
     torch.testing.assert_close((2 * found).sqrt(), (distance / 2).clamp((2e-3) ** 0.5, 0.1**0.5))
     assert {1e-3, 0.05} <= {round(length, 6) for length in found.tolist()}
-    torch.testing.assert_close(free_step(Channel(), x, [0], 1e-3, 10.0), (distance / 2).square().clamp(min=1e-3))
-    assert torch.equal(free_step(Channel(), x, [0, 1], 0.05, 0.05), torch.full((200,), 0.05))
+    one = free_step(Channel(), x, faces, [0], 1e-3, 10.0)
+    torch.testing.assert_close(one, (distance / 2).square().clamp(min=1e-3))
+    assert torch.equal(free_step(Channel(), x, faces, [0, 1], 0.05, 0.05), torch.full((200,), 0.05))
 
 
 def test_a_level_without_a_number_leaves_the_shortest_step():
@@ -323,7 +337,8 @@ def test_a_level_without_a_number_leaves_the_shortest_step():
             return torch.where(x[..., 1] > 0.5, torch.nan, super().avoid_level(x))
 
     x = torch.tensor([[0.0, 0.6], [0.0, 0.4]])
-    assert free_step(Torn(), x, [0, 1], 1e-3, 0.05).tolist() == pytest.approx([1e-3, 0.05])
+    found = free_step(Torn(), x, absorbing_faces(Torn(), x), [0, 1], 1e-3, 0.05)
+    assert found.tolist() == pytest.approx([1e-3, 0.05])
 
 
 class Rippled:
@@ -354,7 +369,7 @@ def test_several_actions_at_once_have_the_values_of_each_of_them_beside_faces(cr
     level = torch.minimum(problem.avoid_level(x), problem.target_level(x)).abs()
     x = x[problem.interior(x)][level[problem.interior(x)] < 0.05]
     tau, actions = torch.full((len(x),), 0.5), 2 * torch.rand(3, 2, len(x), 2) - 1
-    objective = expected_ahead(solution, tau, x, 0.05, [0, 1])
+    objective = expected_ahead(solution, tau, x, absorbing_faces(problem, x), 0.05, [0, 1])
     found, u, h = objective(actions), problem.controls.denormalize(actions), 0.05
     for i, j in itertools.product(range(3), range(2)):
         drift, sigma, duration = problem.drift(x, u[i, j]), problem.diffusion(x, u[i, j]), torch.full_like(tau, h)
@@ -460,6 +475,30 @@ def test_inertia_decides_between_levels_that_are_nearly_as_good(tilt, inertia, e
     best, stakes = improved(lambda a: (a.abs() + tilt * a).squeeze(-1), start, levels, inertia)
     assert best.item() == expected
     assert stakes.item() == pytest.approx(1 + tilt)
+
+
+@pytest.mark.parametrize(("disaster", "expected"), [(-1.0, 1.0), (0.0, -0.5)])
+def test_a_level_that_is_much_worse_holds_back_an_action_that_would_pass_it_alone(disaster, expected):
+    """f(a) = a from -0.5, less 100 at one level, which lies behind the action or between it and the best level."""
+
+    def objective(action):
+        level = action.squeeze(-1)
+        return level - 100 * (level == disaster)
+
+    best, stakes = improved(objective, torch.tensor([[-0.5]]), torch.tensor([-1.0, 0.0, 1.0]), 0.1)
+    assert best.item() == expected
+    assert stakes.item() == pytest.approx(1 - (disaster - 100))
+
+
+def test_a_combination_is_held_back_by_those_in_the_box_between_alone():
+    """f(a) = a_1 + a_2 from (-1, -1), less 100 at (-1, 1), which is a corner of the box up to (1, 1), or at (-1, 2)."""
+    levels = torch.cartesian_prod(torch.tensor([-1.0, 1.0]), torch.tensor([-1.0, 1.0, 2.0]))
+    for disaster, expected in (((-1.0, 1.0), [1.0, -1.0]), ((-1.0, 2.0), [1.0, 1.0])):
+
+        def objective(action, disaster=disaster):
+            return action.sum(-1) - 100 * (action == torch.tensor(disaster)).all(-1)
+
+        assert improved(objective, -torch.ones(1, 2), levels, 0.1)[0].tolist() == [expected]
 
 
 def test_inertia_does_not_matter_where_the_objective_is_affine():

@@ -7,7 +7,7 @@ import torch
 
 import pirl_rl
 from pirl_rl import Box, ReachAvoidProblem
-from pirl_rl.action_values import continued_value, free_step
+from pirl_rl.action_values import absorbing_faces, continued_value, free_step
 from pirl_rl.layers import LogLevels
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.problems import DoubleIntegrator
@@ -158,7 +158,9 @@ def test_the_nearest_face_is_that_of_the_shortest_way_and_not_of_the_smallest_le
         continued_value(Solution(problem, actor, critic), torch.full((3,), 0.5), inside) for problem in (one, other)
     ]
     torch.testing.assert_close(*found)
-    lengths = [free_step(problem, outside, [0, 1], 1e-9, 0.1) for problem in (one, other)]
+    lengths = [
+        free_step(problem, outside, absorbing_faces(problem, outside), [0, 1], 1e-9, 0.1) for problem in (one, other)
+    ]
     torch.testing.assert_close(*lengths)
     assert lengths[0].max() < 0.1
 
@@ -206,7 +208,8 @@ def test_a_free_step_sees_noise_that_two_opposite_corners_of_the_controls_do_not
     x = torch.tensor([[-0.899, 0.7]])
     for problem in (Difference(), Middle()):
         # A noise of 0.3 goes half of the millimetre to the wall within (0.0005/0.3)^2 s.
-        assert free_step(problem, x, [0], 1e-9, 0.1).item() == pytest.approx((0.0005 / 0.3) ** 2, rel=1e-3)
+        length = free_step(problem, x, absorbing_faces(problem, x), [0], 1e-9, 0.1)
+        assert length.item() == pytest.approx((0.0005 / 0.3) ** 2, rel=1e-3)
 
 
 def test_levels_that_are_huge_deep_in_a_set_have_the_resolution_of_others():

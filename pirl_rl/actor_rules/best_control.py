@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from pirl_rl.action_values import Flow, expected_ahead, free_step, hamiltonian, value_ahead
+from pirl_rl.action_values import Face, Flow, absorbing_faces, expected_ahead, free_step, hamiltonian, value_ahead
 from pirl_rl.actor_rules.base import ActorRule
 from pirl_rl.ascent import Objective, improved
 from pirl_rl.errors import ArgumentError
@@ -85,11 +85,11 @@ class BestControl(ActorRule):
             w/2 for a cubature with the noise of w channels: each of its 2w ends counts as a quarter, since it needs V
             alone.
         inertia: what a level loses for each unit of its distance from the actor's output when levels are compared, as a
-            share of the range of the Hamiltonian, >= 0; see `pirl_rl.ascent.improved`. Where noise grows with |u|, both
-            bounds are good beside a convex obstacle, and the worst control lies between them. Without inertia the
-            better bound changes with each small change of V, and an actor that follows comes to rest between both.
-            None takes `CHOICE_INERTIA` for an actor that chooses among numbers, if sigma does not depend on u, and
-            else `INERTIA`.
+            share of the range of the Hamiltonian between the two, >= 0; see `pirl_rl.ascent.improved`. Where noise
+            grows with |u|, both bounds are good beside a convex obstacle, and the worst control lies between them.
+            Without inertia the better bound changes with each small change of V, and an actor that follows comes to
+            rest between both. None takes `CHOICE_INERTIA` for an actor that chooses among numbers, if sigma does not
+            depend on u, and else `INERTIA`.
         ahead: the length of the step of a cubature away from faces, as a share of the horizon, >= 0. The step is never
             shorter than a control step, so that 0 takes one control step everywhere.
 
@@ -169,8 +169,9 @@ class BestControl(ActorRule):
         """The action (N, m) with the best levels, block by block, and how much each group matters (N, g), in 1/s."""
         stride = STRIDE if self.cubature and levels.shape == (FINE_LEVELS, 1) else 1
         blocks, order, stakes = self.blocks(levels.shape[1]), [], []
+        faces = absorbing_faces(solution.problem, x) if any(blocks) else []
         for channels, groups in blocks.items():
-            objective, duration = self._objective(solution, tau, x, channels)
+            objective, duration = self._objective(solution, tau, x, faces, channels)
             tried = groups if len(blocks) > 1 else None
             action, found = improved(objective, action, levels, inertia, stride, tried)
             order, stakes = order + groups, [*stakes, found / duration]
@@ -180,15 +181,18 @@ class BestControl(ActorRule):
         return action, weight
 
     def _objective(
-        self, solution: Solution, tau: Tensor, x: Tensor, channels: tuple[int, ...]
+        self, solution: Solution, tau: Tensor, x: Tensor, faces: list[Face], channels: tuple[int, ...]
     ) -> tuple[Objective, float | Tensor]:
-        """What is maximised, and its unit in s, one number or those of all points (N, 1)."""
+        """What is maximised, and its unit in s, one number or those of all points (N, 1).
+
+        `faces` are those at x, which only an objective with noise channels needs.
+        """
         dt = self.simulator.dt
         if self.steps:
             return value_ahead(solution, self.simulator, tau, x, self.steps, self.flow), dt
         if channels:
-            length = free_step(solution.problem, x, channels, dt, self.longest).minimum(tau)
-            return expected_ahead(solution, tau, x, length, channels), length.unsqueeze(-1)
+            length = free_step(solution.problem, x, faces, channels, dt, self.longest).minimum(tau)
+            return expected_ahead(solution, tau, x, faces, length, channels), length.unsqueeze(-1)
         return hamiltonian(solution, tau, x, self.controlled_noise and not self.cubature), 1.0
 
     def check(self, critic: Critic, exploration_noise: float | None = None) -> None:
