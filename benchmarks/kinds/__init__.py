@@ -4,6 +4,8 @@ from benchmarks.kinds.approaches import Chain, Pursuit, Rendezvous, Unicycle
 from benchmarks.kinds.compartments import Anaesthesia, HerdImmunity, LotkaVolterra, LynxAndHare, Rooms
 from benchmarks.kinds.cycles import JetLag, PowerSwing, Runaway, Searchlight
 from benchmarks.kinds.demands import Backburn, ChemoWard, IslandGrid, VaccineStock
+from benchmarks.kinds.flights import Descent, Encounter, Gantry
+from benchmarks.kinds.markets import Endowment, Granary
 from benchmarks.kinds.masses import Crosswind, Gusty, Lander, Orbit, Servo, Sprint, VanDerPol
 from benchmarks.kinds.mixtures import Bearing, Mirror, Mixture
 from benchmarks.kinds.other_constants import OTHERS
@@ -22,6 +24,6 @@ KINDS += (Investor, Runaway, JetLag, Searchlight, PowerSwing, Forager, Ferment, 
 KINDS += (Bearing, Mirror, Duffing, MountainCar, Swingup, Pursuit, Rooms, Anaesthesia)
 KINDS += (LotkaVolterra, Chain, Unicycle, Rendezvous, FastRiver, Glider, Reactor, Fishery)
 KINDS += (VaccineStock, Backburn, ChemoWard, IslandGrid, StraitFerry, QuietStance, LynxAndHare, HerdImmunity)
-KINDS += (TackingYacht,)
+KINDS += (TackingYacht, Encounter, Descent, Gantry, Endowment, Granary)
 
 PROBLEMS = {kind.__name__: kind for kind in KINDS} | OTHERS
