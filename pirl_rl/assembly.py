@@ -13,7 +13,7 @@ import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 
 from pirl_rl.automatic import (
-    choose_choices,
+    choose_actor,
     choose_paths,
     choose_playing,
     choose_probes,
@@ -52,8 +52,8 @@ def pick_device(name: str) -> torch.device:
 def make_networks(
     config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[str] = ()
 ) -> tuple[Actor, list[Critic]]:
-    """New networks, the actor and the critics, on the configuration's device; `auto` in actor.choices is replaced."""
-    choose_choices(config, problem, trust)
+    """New networks, the actor and the critics, on the configuration's device; `auto` in actor.* is replaced."""
+    choose_actor(config, problem, trust)
     device = pick_device(config.device)
     actor = build(config.actor, "actor", trust, problem=problem).to(device)
     count = convert(config.critics, Literal[1, 2], "critics")

@@ -11,7 +11,7 @@ from pirl_rl.building import convert, resolve
 from pirl_rl.errors import ArgumentError, ConfigError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
-from pirl_rl.structure import check_problem, noise_channels
+from pirl_rl.structure import check_problem, has_controlled_noise, noise_channels
 from pirl_rl.switching import actor_choices, coordinates_together
 from pirl_rl.time_steps import STEPS, check_time_steps, propose_time_steps
 
@@ -19,7 +19,7 @@ AUTO = "auto"
 """The value that leaves a choice to the package.
 
 Keys that take it: env.dt, env.substeps, env.num_envs, collector.n_steps, n_steps of a stage, trainer.updates,
-actor.choices, actor.together, loss.hjb_time, loss.hjb_probes and the entries of `PATHS`.
+actor.choices, actor.together, actor.log_levels, loss.hjb_time, loss.hjb_probes and the entries of `PATHS`.
 """
 
 UPDATES_PER_DIMENSION, FEW_STATES, UPDATES_OF_MANY = 2_300, 3, 2_900
@@ -112,12 +112,15 @@ def choose_updates(config: DictConfig, problem: ReachAvoidProblem) -> None:
             config.trainer.updates = min(UPDATES_OF_MANY * (n + 1), max(1, MOST_COST // (BASE_COST + n)))
 
 
-def choose_choices(config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[str] = ()) -> None:
-    """Replace `auto` in actor.choices and actor.together by numbers that follow from the problem.
+def choose_actor(config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[str] = ()) -> None:
+    """Replace `auto` in actor.choices, actor.together and actor.log_levels by values that follow from the problem.
 
     `pirl_rl.switching.actor_choices` says where an actor chooses, and among how many levels. It does not where a rule
     of the run, or of one of its stages, needs the gradient of the policy, or looks ahead: a control that is held for
     long cannot make up for a coarse level by switching to the next.
+
+    Logarithms of the levels of the sets are inputs where sigma depends on the control. The noise that is best then
+    changes within the layers at faces, whose widths are those of the noise.
 
     Args:
         config: the configuration of a run.
@@ -131,6 +134,8 @@ def choose_choices(config: DictConfig, problem: ReachAvoidProblem, trust: Sequen
     if config.actor.get("together") == AUTO:
         choices = config.actor.get("choices")
         config.actor.together = coordinates_together(problem, choices) if isinstance(choices, int) else 1
+    if config.actor.get("log_levels") == AUTO:
+        config.actor.log_levels = bool(config.actor.get("levels")) and has_controlled_noise(problem)
 
 
 def _all_suit_choices(config: DictConfig, trust: Sequence[str]) -> bool:

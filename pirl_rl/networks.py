@@ -36,6 +36,7 @@ class Actor(nn.Module):
             points that are uniform in the box. None takes the usual initialisation, for which all zeros pass near the
             middle of the box.
         levels: whether the levels of the constraints of A and B are inputs too, see `Levels`.
+        log_levels: whether the logarithms of these levels are inputs beside them, see `LogLevels`.
         choices: None makes each coordinate of the control a hyperbolic tangent. With an integer of at least 2 it is one
             of so many numbers evenly spaced over [-1, 1], bounds included, each of which has a score, see `Choice`. The
             control may then jump between two of them along a surface, where a hyperbolic tangent has to pass through
@@ -45,8 +46,9 @@ class Actor(nn.Module):
             same surface.
 
     Raises:
-        ArgumentError: `activation` is not the name of a layer of `torch.nn`, `spread` is not positive, `choices` is no
-            integer of at least 2, or `together` does not divide the number of controls.
+        ArgumentError: `activation` is not the name of a layer of `torch.nn`, `spread` is not positive, `log_levels` is
+            given without `levels`, `choices` is no integer of at least 2, or `together` does not divide the number of
+            controls.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class Actor(nn.Module):
         root_time: bool = False,
         spread: float | None = None,
         levels: bool = False,
+        log_levels: bool = False,
         choices: int | None = None,
         together: int = 1,
     ):
@@ -69,7 +72,9 @@ class Actor(nn.Module):
                 raise ArgumentError(f"together: expected a divisor of the number {outputs} of controls, got {together}")
             outputs = outputs // together * self.choice.choices**together
         output = self.choice or "Tanh"
-        self.layers = perceptron(problem, 0, hidden, outputs, activation, output, root_time, scaling, levels)
+        self.layers = perceptron(
+            problem, 0, hidden, outputs, activation, output, root_time, scaling, levels, log_levels
+        )
         spread_zeros(self.layers, spread, problem, 0)
 
     def logits(self, tau: Tensor, state: Tensor) -> Tensor:

@@ -24,9 +24,11 @@ from pirl_rl.action_values import (
 from pirl_rl.actor_rules import BestControl, Hamiltonian
 from pirl_rl.ascent import ascend, improved
 from pirl_rl.assembly import make_trainer
-from pirl_rl.automatic import choose_choices
+from pirl_rl.automatic import choose_actor
+from pirl_rl.building import build
 from pirl_rl.commands.composition import compose
 from pirl_rl.errors import ArgumentError, ConfigError
+from pirl_rl.layers import LogLevels
 from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.problems import PlanarQuadrotor, Reach1D, VehicleDrift, VehicleDrift3
 from pirl_rl.simulator import Simulator
@@ -703,8 +705,26 @@ def test_where_an_actor_chooses(problem, choices):
 )
 def test_the_actor_chooses_where_the_noise_depends_on_the_control(controlled, typed, choices):
     config = compose("train", ["+experiment=reach1d", *typed])
-    choose_choices(config, Steered(controlled))
+    choose_actor(config, Steered(controlled))
     assert config.actor.choices == choices
+
+
+@pytest.mark.parametrize(
+    ("controlled", "typed", "logs"),
+    [
+        (False, [], False),
+        (True, [], True),
+        (True, ["actor.log_levels=false"], False),
+        (True, ["actor.levels=false"], False),
+        (False, ["actor.log_levels=true"], True),
+    ],
+)
+def test_the_actor_sees_logarithms_of_levels_where_the_noise_depends_on_the_control(controlled, typed, logs):
+    config = compose("train", ["+experiment=reach1d", *typed])
+    choose_actor(config, Steered(controlled))
+    assert config.actor.log_levels is logs
+    layers = build(config.actor, "actor", problem=Steered(controlled)).layers
+    assert any(isinstance(layer, LogLevels) for layer in layers) == logs
 
 
 @pytest.mark.parametrize(
@@ -720,7 +740,7 @@ def test_the_actor_chooses_where_the_noise_depends_on_the_control(controlled, ty
 )
 def test_the_actor_chooses_whole_controls_where_their_combinations_are_few(problem, typed, choices, together):
     config = compose("train", ["+experiment=reach1d", *typed])
-    choose_choices(config, problem)
+    choose_actor(config, problem)
     assert (config.actor.choices, config.actor.together) == (choices, together)
 
 

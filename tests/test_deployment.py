@@ -26,7 +26,7 @@ from pirl_rl.errors import ArgumentError, ConfigError
 from pirl_rl.layers import Levels
 from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.payoffs import LipschitzPayoff
-from pirl_rl.problems import DubinsCar, Pendulum, PlanarQuadrotor, Reach1D
+from pirl_rl.problems import DubinsCar, Pendulum, PlanarQuadrotor, Reach1D, ZermeloBoat
 from pirl_rl.problems.drift.problem import VehicleDrift
 from pirl_rl.sampling.faces import find_faces
 from pirl_rl.solution import Solution
@@ -53,14 +53,14 @@ np.savez(sys.argv[3], **answer, **{"meta_" + name: np.array(entry) for name, ent
 """
 
 
-def solution_of(problem: ReachAvoidProblem, critics: int = 1, choice: dict | None = None, **settings) -> Solution:
+def solution_of(problem: ReachAvoidProblem, critics: int = 1, actor: dict | None = None, **settings) -> Solution:
     """New networks for a problem, with a fixed seed."""
     torch.manual_seed(0)
     features = {"root_time": True, "levels": True, "activation": "SiLU", "spread": 3.0, "hidden": (16,)}
     critic = features | {"output": "Sigmoid", "log_levels": settings.get("levels", True)} | settings
     return Solution(
         problem,
-        Actor(problem, **features, **(choice or {})),
+        Actor(problem, **features, **(actor or {})),
         stack([Critic(problem, **critic) for _ in range(critics)]),
     )
 
@@ -111,10 +111,21 @@ def dubins(tmp_path_factory) -> tuple[Solution, Path]:
         solution_of(Pendulum(), activation="Tanh"),
         solution_of(VehicleDrift()),
         solution_of(Reach1D(), hidden=()),
-        solution_of(PlanarQuadrotor(), choice={"choices": 5}),
-        solution_of(PlanarQuadrotor(), choice={"choices": 3, "together": 2}),
+        solution_of(PlanarQuadrotor(), actor={"choices": 5}),
+        solution_of(PlanarQuadrotor(), actor={"choices": 3, "together": 2}),
+        solution_of(ZermeloBoat(), actor={"log_levels": True}),
     ],
-    ids=["periodic", "smoothed", "plain", "invariance", "unreachable", "no avoid set", "choices", "together"],
+    ids=[
+        "periodic",
+        "smoothed",
+        "plain",
+        "invariance",
+        "unreachable",
+        "no avoid set",
+        "choices",
+        "together",
+        "logarithms",
+    ],
 )
 def test_the_program_computes_what_the_solution_does(solution):
     """In double precision nothing but rounding differs, of the order of 1e-16 times the slope of the networks."""
