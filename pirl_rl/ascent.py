@@ -63,7 +63,7 @@ def improved(
     coordinates in a group. Between the two maxima of a function whose minimum lies in the middle, an action then goes
     to one and stays there. A level that is much worse than the action and than the level under trial, and does not lie
     between them, does not hold the action back. Where the objective is affine in a coordinate, the best of two bounds
-    stays the best with any inertia of at most 1/4.
+    stays the best with any inertia below 1/2, and the best of more levels with any of at most 1/4.
 
     Args:
         objective: the function to maximise, for actions (*, N, m).

@@ -1,10 +1,10 @@
 """Problems of other kinds than those of the suite, written as a user would, and the suite's with other constants."""
 
-from benchmarks.kinds.approaches import Chain, Pursuit, Rendezvous, Unicycle
+from benchmarks.kinds.approaches import Chain, Gantry, Pursuit, Rendezvous, Unicycle
 from benchmarks.kinds.compartments import Anaesthesia, HerdImmunity, LotkaVolterra, LynxAndHare, Rooms
 from benchmarks.kinds.cycles import JetLag, PowerSwing, Runaway, Searchlight
 from benchmarks.kinds.demands import Backburn, ChemoWard, IslandGrid, VaccineStock
-from benchmarks.kinds.flights import Descent, Encounter, Gantry
+from benchmarks.kinds.flights import Descent, Encounter
 from benchmarks.kinds.markets import Endowment, Granary
 from benchmarks.kinds.masses import Crosswind, Gusty, Lander, Orbit, Servo, Sprint, VanDerPol
 from benchmarks.kinds.mixtures import Bearing, Mirror, Mixture

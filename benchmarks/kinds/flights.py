@@ -1,10 +1,9 @@
-"""An encounter in the air, a landing with little fuel, and a trolley that is moved by its jerk: three states each."""
+"""An encounter in the air, and a landing with little fuel."""
 
 from __future__ import annotations
 
 import math
 
-import torch
 from torch import Tensor
 
 from benchmarks.kinds.shapes import constant, rows
@@ -54,22 +53,3 @@ class Descent(ReachAvoidProblem):
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
         return rows(x[..., 0], x[..., 2])
-
-
-class Gantry(ReachAvoidProblem):
-    """Bring a trolley to rest between two walls by its jerk; noise in the acceleration alone."""
-
-    horizon = 2.0
-    states, controls = Box([-1.0, -1.5, -2.0], [1.0, 1.5, 2.0]), Box([-5.0], [5.0])
-
-    def drift(self, x: Tensor, u: Tensor) -> Tensor:
-        return torch.cat([x[..., 1:], u], -1)
-
-    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
-        return constant(x, [0.0], [0.0], [1.5])
-
-    def target_constraints(self, x: Tensor) -> Tensor:
-        return x.abs() - x.new_tensor([0.2, 0.3, 0.8])
-
-    def avoid_constraints(self, x: Tensor) -> Tensor:
-        return rows(1 - x[..., 0].abs(), 1.5 - x[..., 1].abs())

@@ -169,7 +169,7 @@ class BestControl(ActorRule):
         """The action (N, m) with the best levels, block by block, and how much each group matters (N, g), in 1/s."""
         stride = STRIDE if self.cubature and levels.shape == (FINE_LEVELS, 1) else 1
         blocks, order, stakes = self.blocks(levels.shape[1]), [], []
-        faces = absorbing_faces(solution.problem, x) if any(blocks) else []
+        faces = absorbing_faces(solution.problem, x) if self.cubature else []
         for channels, groups in blocks.items():
             objective, duration = self._objective(solution, tau, x, faces, channels)
             tried = groups if len(blocks) > 1 else None
