@@ -698,6 +698,41 @@ def test_the_estimate_sees_jumps_that_both_meshes_smear_alike():
     assert (solution._distance(tau, x)[wrong] <= DOUBT).double().mean() > 0.05, "the distance of both would do"
 
 
+class Shear(ReachAvoidProblem):
+    """Run to x_1 >= 1 at speed 1 in lanes with noise of the strength x_2, which nobody leaves."""
+
+    horizon = 2.0
+    states, controls = Box([-1.0, 0.02], [1.0, 1.0]), Box([-1.0], [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.stack([1 + 0 * u[..., 0], 0 * x[..., 1]], -1)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.stack([x[..., 1], 0 * x[..., 1]], -1).unsqueeze(-1)
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return 1 - x[..., 0]
+
+    def exact_value(self, tau: Tensor, x: Tensor) -> Tensor:
+        return first_passage(tau, 1 - x[..., 0], 1.0, x[..., 1])
+
+
+def test_the_estimate_sees_what_upwind_jumps_smear_where_the_noise_is_weak_in_a_part_of_the_box():
+    problem = Shear()
+    tau, x = points(problem, 2_000)
+    solution = GridSolver(problem, points=41).solve()
+    assert not solution.split
+    error = (solution.value(tau, x) - problem.exact_value(tau, x)).abs()
+    wrong, estimate = error > 0.1, solution.error(tau, x)
+    assert wrong.sum() > 20
+    assert (x[wrong, 1] < 0.2).all()
+    assert (estimate[wrong] > DOUBT).all()
+    assert (solution._distance(tau, x)[wrong] <= DOUBT).double().mean() > 0.05, "the distance of both would do"
+    # Where the noise is stronger than that of the jumps, it is the distance alone.
+    strong = x[:, 1] > 0.3
+    assert (estimate[strong] < DOUBT).double().mean() > 0.9
+
+
 class Hasty(Landfall):
     """A `Landfall` whose height has so much noise that only the largest speed is large beside the noise."""
 

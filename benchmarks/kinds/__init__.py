@@ -5,13 +5,14 @@ from benchmarks.kinds.compartments import Anaesthesia, HerdImmunity, LotkaVolter
 from benchmarks.kinds.cycles import JetLag, PowerSwing, Runaway, Searchlight
 from benchmarks.kinds.demands import Backburn, ChemoWard, IslandGrid, VaccineStock
 from benchmarks.kinds.flights import Descent, Encounter
-from benchmarks.kinds.markets import Endowment, Granary
+from benchmarks.kinds.journeys import Barge, Scooter, SolarCar
+from benchmarks.kinds.markets import Endowment, Granary, PairTrade
 from benchmarks.kinds.masses import Crosswind, Gusty, Lander, Orbit, Servo, Sprint, VanDerPol
 from benchmarks.kinds.mixtures import Bearing, Mirror, Mixture
 from benchmarks.kinds.other_constants import OTHERS
 from benchmarks.kinds.passages import FastRiver, Glider, SlotChange, StraitFerry, TackingYacht, TwoLink
 from benchmarks.kinds.plants import Epidemic, Investor, Reactor, Reservoir, Toggle, Tokens, TwoTanks
-from benchmarks.kinds.stores import FastCharge, Ferment, Fishery, Forager
+from benchmarks.kinds.stores import Chemostat, FastCharge, Ferment, Fishery, Forager
 from benchmarks.kinds.swings import Duffing, MountainCar, QuietStance, Swingup
 from benchmarks.kinds.vehicles import Bicycle, Evader, Loiter, Ring, River, Slalom, Steering, TwoCars, TwoHarbours
 from pirl_rl import ReachAvoidProblem
@@ -24,6 +25,7 @@ KINDS += (Investor, Runaway, JetLag, Searchlight, PowerSwing, Forager, Ferment, 
 KINDS += (Bearing, Mirror, Duffing, MountainCar, Swingup, Pursuit, Rooms, Anaesthesia)
 KINDS += (LotkaVolterra, Chain, Unicycle, Rendezvous, FastRiver, Glider, Reactor, Fishery)
 KINDS += (VaccineStock, Backburn, ChemoWard, IslandGrid, StraitFerry, QuietStance, LynxAndHare, HerdImmunity)
-KINDS += (TackingYacht, Encounter, Descent, Gantry, Endowment, Granary)
+KINDS += (TackingYacht, Encounter, Descent, Gantry, Endowment, Granary, PairTrade, Chemostat)
+KINDS += (SolarCar, Scooter, Barge)
 
 PROBLEMS = {kind.__name__: kind for kind in KINDS} | OTHERS

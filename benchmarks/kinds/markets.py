@@ -1,4 +1,4 @@
-"""An endowment in a market whose noise comes and goes, and a granary that is filled when grain is cheap."""
+"""An endowment, a pair of shares and a granary: to gain or to fill something before means are used up."""
 
 from __future__ import annotations
 
@@ -54,3 +54,28 @@ class Granary(ReachAvoidProblem):
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
         return x[..., 1:]
+
+
+class PairTrade(ReachAvoidProblem):
+    """Gain a quarter of the means before a quarter is lost, by trading on a spread of prices that comes back to 0.
+
+    The states are the spread and the means, the control is how much of the spread is held, bought or sold. The same
+    noise moves both states, and it grows with the control.
+    """
+
+    horizon = 1.0
+    states, controls = Box([-1.0, 0.7], [1.0, 1.3]), Box([-1.0], [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        back = -2 * x[..., 0]
+        return rows(back, u[..., 0] * back)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        held = u[..., 0]
+        return 0.6 * rows(torch.ones_like(x[..., 0] * held), held + 0 * x[..., 0]).unsqueeze(-1)
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return 1.25 - x[..., 1:]
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        return x[..., 1:] - 0.75

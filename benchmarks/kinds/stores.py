@@ -97,3 +97,22 @@ class Fishery(ReachAvoidProblem):
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
         return rows(x[..., 0] - 0.1, x[..., 1])
+
+
+class Chemostat(ReachAvoidProblem):
+    """Grow bacteria from a few milligrams to 4 g/l in 16 h; the inflow feeds them, and washes them out; g/l and h."""
+
+    horizon = 16.0
+    states, controls = Box([0.02, 0.0], [5.0, 10.0]), Box([0.0], [0.6])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        bacteria, sugar = x.unbind(-1)
+        growth = 0.5 * sugar / (1 + sugar) * bacteria
+        inflow = u[..., 0]
+        return rows(growth - inflow * bacteria - 0.03 * bacteria, inflow * (10 - sugar) - 2 * growth)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return rows(0.2 * x[..., 0], 0 * x[..., 0]).unsqueeze(-1)
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return (4 - x[..., :1]) / 4

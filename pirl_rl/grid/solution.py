@@ -15,6 +15,7 @@ from pirl_rl.files import replacing
 from pirl_rl.grid.faces import mean_beyond_faces
 from pirl_rl.grid.field import Field
 from pirl_rl.grid.mesh import Mesh
+from pirl_rl.grid.transport import WEAK
 from pirl_rl.problem import ReachAvoidProblem
 
 SMALLEST = 1e-6
@@ -203,7 +204,9 @@ class GridSolution:
         the face within a layer that is thinner than the cell. Where V is linear in such cells, both solutions are near
         the value of the set close to the face, and so the largest of the distances at x and at the corners counts.
         Where drift and noise act in turns, V may jump, and both solutions smear a jump alike. Large second differences
-        of V show this, and count where they are larger than the distance. What neither can show is added, see `unseen`.
+        of V show this, and count where they are larger than the distance. Where they act at once, and the scheme adds
+        more noise than there is, both solutions smear V alike too, and its deviation under the added noise counts. What
+        neither can show is added, see `unseen`.
 
         Raises:
             ArgumentError: the solution was computed without an estimate, or a tau is outside [0, horizon].
@@ -227,11 +230,27 @@ class GridSolution:
             corners = torch.from_numpy(self.mesh.states(self.mesh.indices()[nodes])).to(x)
             distance = self._distance(tau[cut], corners).where(self.problem.interior(corners), 0.0)
             error[cut] = torch.maximum(error[cut], distance)
-        return error
+        return torch.maximum(error, self._smear(tau, x))
 
     def _distance(self, tau: Tensor, x: Tensor) -> Tensor:
         """The distance (P,) of the interpolated V from that of the coarse solution."""
         return (self.field(tau, x) - self.coarse.field(tau, x)).abs()  # type: ignore[union-attr]
+
+    def _smear(self, tau: Tensor, x: Tensor) -> Tensor:
+        """The deviation (P,) of V under the noise that the scheme adds, where along the slope of V it is the stronger.
+
+        Upwind jumps along axis i, with nodes h_i apart, add noise of the variance h_i |f_i| per unit of time, and
+        implicit steps of the length dt add (f dt)^2 in each of them.
+        """
+        control, slope = self.policy(tau, x), self.gradient(tau, x)
+        drift, sigma = self.problem.drift(x, control), self.problem.diffusion(x, control)
+        jumps = (torch.as_tensor(self.mesh.spacing).to(x) * drift.abs() * slope.square()).sum(-1)
+        noise = (sigma * slope.unsqueeze(-1)).sum(-2).square().sum(-1)
+        # The steps are equidistant in sqrt(tau).
+        dt = 2 * (tau * self.problem.horizon).sqrt() / self.steps
+        deviation = (tau * (jumps + dt * (drift * slope).sum(-1).square())).sqrt()
+        # Inside a set the physics may have no number, and there V is known.
+        return deviation.where(jumps > WEAK * noise, 0.0).nan_to_num(0.0)
 
     def _bend(self, tau: Tensor, x: Tensor) -> Tensor:
         """The largest second difference (P,) of V, of those along the axes at x and one cell beside it."""
