@@ -18,6 +18,7 @@ from pirl_rl.commands.settings import compose_run
 from pirl_rl.errors import ArgumentError, ConfigError, Interrupted
 from pirl_rl.problems import Reach1D
 from pirl_rl.run_directory import RunDirectory
+from pirl_rl.runs import run as runs
 
 SETTINGS = {
     "updates": 12,
@@ -86,6 +87,25 @@ def test_a_single_state_has_the_result_of_a_row(name, run):
     assert one.shape == row.shape[1:]
     assert np.array_equal(one, row[0])
     assert run[1].reach_avoid_set(0.5, 1.0)([0.3]).shape == ()
+
+
+@pytest.mark.parametrize("name", ["value", "residual", "gradient", "policy"])
+def test_many_states_are_evaluated_in_parts(name, run, monkeypatch):
+    x = np.linspace(-2, 2, 101).reshape(1, 101, 1)
+    whole = getattr(run[1], name)(1.0, x)
+    rows, function = [], getattr(run[1].solution, name)
+
+    def counted(tau, x):
+        rows.append(len(x))
+        return function(tau, x)
+
+    monkeypatch.setattr(runs, "AT_ONCE", 40)
+    monkeypatch.setattr(run[1].solution, name, counted)
+    parts = getattr(run[1], name)(1.0, x)
+    assert rows == [40, 40, 21]
+    assert parts.shape == whole.shape
+    np.testing.assert_allclose(parts, whole, rtol=1e-5, atol=1e-6)
+    assert getattr(run[1], name)(1.0, x[:, :0]).shape[:2] == (1, 0)
 
 
 def test_gradient_is_the_slope_of_the_value(run):

@@ -27,6 +27,9 @@ from pirl_rl.simulator import Crossing, Simulator
 from pirl_rl.solution import Solution
 from pirl_rl.switching import candidate_controls
 
+AT_ONCE = 2**14
+"""The number of states that the networks evaluate at once, so that the nodes of a fine mesh do not fill the memory."""
+
 
 class Run:
     """A trained solution, for numpy arrays and torch tensors: results are of the kind of the argument x.
@@ -264,7 +267,8 @@ class Run:
 
     def _call(self, function: Callable[[Tensor, Tensor], Tensor], tau, x):
         times, state, answer = self._arguments(tau, x)
-        result = function(times.reshape(-1), state.reshape(-1, state.shape[-1]))
+        parts = zip(times.reshape(-1).split(AT_ONCE), state.reshape(-1, state.shape[-1]).split(AT_ONCE), strict=True)
+        result = torch.cat([function(*part) for part in parts])
         return answer(result.reshape((*times.shape, *result.shape[1:])))
 
     def _starts(self, tau, x) -> tuple[Tensor, Tensor, Callable[[Tensor], Any]]:
