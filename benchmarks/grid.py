@@ -5,6 +5,7 @@ It also compares the success of a run's policy with that of the grid's.
 python benchmarks/grid.py [--json FILE]   # one and two dimensions
 python benchmarks/grid.py --own DubinsCar   # V against Monte Carlo of the grid's own policy, some minutes
 python benchmarks/grid.py --run RUN_DIR   # a run with at most three states
+python benchmarks/grid.py --run RUN_DIR --own HerdImmunity   # likewise, of a problem of `benchmarks.kinds`
 """
 
 from __future__ import annotations
@@ -85,9 +86,20 @@ def against_itself(problem: ReachAvoidProblem, points: int, seed: int, rollouts:
     print(f"of the {trusted.sum()} states with an estimate of at most {DOUBT} {within[trusted].mean():.2f}")
 
 
-def against(run_dir: str, points: int, steps: int | None, seed: int, rollouts: int = 400, count: int = 400) -> None:
-    """Print the mean success of a run's policy and of the grid's, at the same states and with the same noise."""
-    run = load_run(run_dir)
+def against(
+    run_dir: str,
+    problem: ReachAvoidProblem | None,
+    points: int,
+    steps: int | None,
+    seed: int,
+    rollouts: int = 400,
+    count: int = 400,
+) -> None:
+    """Print the mean success of a run's policy and of the grid's, at the same states and with the same noise.
+
+    The directory of a run that was given an object as its problem does not have the problem.
+    """
+    run = load_run(run_dir, problem=problem)
     problem, simulator = run.problem, run.simulator
     solution, (tau, x) = GridSolver(problem, points, steps).solve(), states(problem, count, seed)
     clock = {"dt": simulator.dt, "substeps": simulator.substeps, "crossing": simulator.crossing}
@@ -102,7 +114,9 @@ def against(run_dir: str, points: int, steps: int | None, seed: int, rollouts: i
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     own = {**PROBLEMS, "DubinsCar": DubinsCar}
-    parser.add_argument("--own", choices=own, help="compare V with Monte Carlo of the grid's own policy")
+    parser.add_argument(
+        "--own", choices=own, help="compare V with Monte Carlo of the grid's own policy; with --run its problem"
+    )
     parser.add_argument("--points", type=int, default=51, help="nodes along each axis")
     parser.add_argument(
         "--steps", type=int, help="steps in time to go, with --run; by default they follow from the problem"
@@ -112,7 +126,8 @@ if __name__ == "__main__":
     parser.add_argument("--json", type=Path, help="write what is found in one and two dimensions to this file")
     arguments = parser.parse_args()
     if arguments.run:
-        against(arguments.run, arguments.points, arguments.steps, arguments.seed)
+        problem = own[arguments.own]() if arguments.own else None
+        against(arguments.run, problem, arguments.points, arguments.steps, arguments.seed)
     elif arguments.own:
         against_itself(own[arguments.own](), arguments.points, arguments.seed)
     else:

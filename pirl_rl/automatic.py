@@ -12,14 +12,15 @@ from pirl_rl.errors import ArgumentError, ConfigError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
 from pirl_rl.structure import check_problem, has_controlled_noise, noise_channels
-from pirl_rl.switching import actor_choices, coordinates_together
+from pirl_rl.switching import actor_choices, choice_window, coordinates_together
 from pirl_rl.time_steps import STEPS, check_time_steps, propose_time_steps
 
 AUTO = "auto"
 """The value that leaves a choice to the package.
 
 Keys that take it: env.dt, env.substeps, env.num_envs, collector.n_steps, n_steps of a stage, trainer.updates,
-actor.choices, actor.together, actor.log_levels, loss.hjb_time, loss.hjb_probes and the entries of `PATHS`.
+actor.choices, actor.together, actor.window, actor.log_levels, loss.hjb_time, loss.hjb_probes and the entries of
+`PATHS`.
 """
 
 UPDATES_PER_DIMENSION, FEW_STATES, UPDATES_OF_MANY = 2_300, 3, 2_900
@@ -113,7 +114,7 @@ def choose_updates(config: DictConfig, problem: ReachAvoidProblem) -> None:
 
 
 def choose_actor(config: DictConfig, problem: ReachAvoidProblem, trust: Sequence[str] = ()) -> None:
-    """Replace `auto` in actor.choices, actor.together and actor.log_levels by values that follow from the problem.
+    """Replace `auto` in choices, together, window and log_levels of the actor by values that follow from the problem.
 
     `pirl_rl.switching.actor_choices` says where an actor chooses, and among how many levels. It does not where a rule
     of the run, or of one of its stages, needs the gradient of the policy, or looks ahead: a control that is held for
@@ -134,6 +135,9 @@ def choose_actor(config: DictConfig, problem: ReachAvoidProblem, trust: Sequence
     if config.actor.get("together") == AUTO:
         choices = config.actor.get("choices")
         config.actor.together = coordinates_together(problem, choices) if isinstance(choices, int) else 1
+    if config.actor.get("window") == AUTO:
+        choices, alone = config.actor.get("choices"), config.actor.get("together") == 1
+        config.actor.window = choice_window(problem, choices) if isinstance(choices, int) and alone else 0.0
     if config.actor.get("log_levels") == AUTO:
         config.actor.log_levels = bool(config.actor.get("levels")) and has_controlled_noise(problem)
 

@@ -209,3 +209,34 @@ class Choice(nn.Module):
         places = ((numbers + 1) * ((self.choices - 1) / 2)).round().long().unflatten(-1, (-1, self.together))
         # The last number of a combination changes first.
         return (places * self.choices ** torch.arange(self.together - 1, -1, -1, device=places.device)).sum(-1)
+
+
+class WindowedChoice(Choice):
+    """For each of m outputs, the mean of those of k numbers that lie in one window, by their shares of a softmax.
+
+    The window reaches from a number l_i by w to both sides, and is the one with the largest share. With the shares p_j
+    of the numbers l_j, the output is sum_j p_j l_j / sum_j p_j over |l_j - l_i| <= w. It changes smoothly with the
+    scores within a window, and jumps where another window takes over. It has no gradient in the scores where it jumps.
+
+    Args:
+        choices: the number k, at least 2.
+        window: w > 0, in units of the outputs.
+
+    Raises:
+        ArgumentError: `choices` is no integer of at least 2, or `window` is not positive.
+    """
+
+    def __init__(self, choices: int, window: float):
+        super().__init__(choices)
+        if not window > 0:
+            raise ArgumentError(f"window: expected a number > 0, got {window!r}")
+        self.window = window
+
+    def forward(self, scores: Tensor) -> Tensor:
+        numbers, share = self.combinations(scores).squeeze(-1), self.grouped(scores).softmax(-1)
+        # A little wider than the window, so that rounding does not decide which numbers lie in it.
+        wide = self.window + 0.1 / self.choices
+        near = ((numbers.unsqueeze(0) - numbers.unsqueeze(1)).abs() <= wide).to(share.dtype)
+        mass, moment = share @ near, (share * numbers) @ near
+        largest = mass.argmax(-1, keepdim=True)
+        return (moment.gather(-1, largest) / mass.gather(-1, largest)).squeeze(-1)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from pirl_rl.errors import ArgumentError
-from pirl_rl.layers import Choice
+from pirl_rl.layers import Choice, WindowedChoice
 from pirl_rl.perceptrons import initialise_xavier, perceptron, spread_zeros
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sets import Box
@@ -44,11 +44,14 @@ class Actor(nn.Module):
         together: the number of coordinates of the control that are chosen together, with one score for each combination
             of their numbers. Where the best control changes in several coordinates at once, they then jump along the
             same surface.
+        window: with a number above 0, a coordinate is the mean of those of its `choices` numbers that lie so close to
+            the best one, see `WindowedChoice`. Where the best control changes many times in a training, that is the
+            mean of those that are alike.
 
     Raises:
         ArgumentError: `activation` is not the name of a layer of `torch.nn`, `spread` is not positive, `log_levels` is
-            given without `levels`, `choices` is no integer of at least 2, or `together` does not divide the number of
-            controls.
+            given without `levels`, `choices` is no integer of at least 2, `together` does not divide the number of
+            controls, or a `window` is negative, or given without `choices` or beside `together` > 1.
     """
 
     def __init__(
@@ -63,10 +66,16 @@ class Actor(nn.Module):
         log_levels: bool = False,
         choices: int | None = None,
         together: int = 1,
+        window: float = 0.0,
     ):
         super().__init__()
         outputs = problem.controls.dim
+        if window and (choices is None or together > 1):
+            got = f"window={window}, choices={choices} and together={together}"
+            raise ArgumentError(f"window: expected choices beside it, and together=1, got {got}")
         self.choice = None if choices is None else Choice(choices, together)
+        if choices is not None and window:
+            self.choice = WindowedChoice(choices, window)
         if self.choice:
             if outputs % together:
                 raise ArgumentError(f"together: expected a divisor of the number {outputs} of controls, got {together}")

@@ -21,6 +21,9 @@ from pirl_rl.structure import has_controlled_noise, is_control_affine
 LEVELS, FINE_LEVELS = 5, 33
 """The numbers of levels of a control where two, its bounds, do not hold the best one, and where five are too few."""
 
+WINDOW = 0.5
+"""How close to the best level others are for a mean of them, of a control whose range is [-1, 1]."""
+
 COARSE = 0.0005
 """What `LEVELS` may lose on average, as a share of the range of the Hamiltonian, before they are too few."""
 
@@ -73,19 +76,30 @@ def actor_choices(problem: ReachAvoidProblem) -> int | None:
     """The number of levels among which an actor chooses for each coordinate of the control, or None for a tanh output.
 
     An actor chooses where the Hamiltonian is not affine in u, so that it jumps over controls that are worse than those
-    on both sides. The exception is a sigma that depends on u where the best control often lies between the bounds.
-    There V is nearly straight where the policy makes strong noise, and bends where it makes weak noise, and the best
-    control in turn depends on how V bends. So the best control at a state changes many times in a training. An actor
-    that chooses ends at one of these controls. A tanh output ends at their mean, which is better where the Hamiltonian
-    is concave in u.
+    on both sides.
 
     Args:
         problem: the physics.
     """
     levels = control_levels(problem)
-    if levels == 2 or (levels == FINE_LEVELS and has_controlled_noise(problem)):
-        return None
-    return levels
+    return None if levels == 2 else levels
+
+
+def choice_window(problem: ReachAvoidProblem, levels: int) -> float:
+    """How close to the best of so many levels others are for a mean of them, see `pirl_rl.layers.WindowedChoice`.
+
+    It is 0, and the best level alone is taken, except where sigma depends on u and the best control often lies between
+    the bounds. There V is nearly straight where the policy makes strong noise, and bends where it makes weak noise, and
+    the best control in turn depends on how V bends. So the best control at a state changes many times in a training. An
+    actor that chooses one level ends at one of these controls, and a tanh output at the mean of all. The first is worse
+    where the Hamiltonian is concave in u, and the second where it is convex: between two strong noises of opposite
+    signs, as of a share that is bought or sold, lies none. The mean of those within a window is good in both cases.
+
+    Args:
+        problem: the physics.
+        levels: the number of levels of each coordinate.
+    """
+    return WINDOW if levels == FINE_LEVELS and has_controlled_noise(problem) else 0.0
 
 
 def coordinates_together(problem: ReachAvoidProblem, levels: int) -> int:

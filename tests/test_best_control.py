@@ -681,11 +681,11 @@ def test_how_the_best_control_changes(problem, joint, coarse):
 
 @pytest.mark.parametrize(
     ("problem", "choices"),
-    [(Steered(), None), (Bicycle(), 5), (Gusty(), 5), (Sprint(), 33), (Investor(), None)],
+    [(Steered(), None), (Bicycle(), 5), (Gusty(), 5), (Sprint(), 33), (Investor(), 33)],
     ids=lambda value: type(value).__name__,
 )
 def test_where_an_actor_chooses(problem, choices):
-    """An actor chooses where the best control jumps; not where it is a bound, nor where it is a strength of noise."""
+    """An actor chooses where the best control jumps in other ways than from bound to bound."""
     assert actor_choices(problem) == choices
 
 
@@ -742,6 +742,26 @@ def test_the_actor_chooses_whole_controls_where_their_combinations_are_few(probl
     config = compose("train", ["+experiment=reach1d", *typed])
     choose_actor(config, problem)
     assert (config.actor.choices, config.actor.together) == (choices, together)
+
+
+@pytest.mark.parametrize(
+    ("problem", "typed", "window"),
+    [
+        (Investor(), [], 0.5),
+        (Investor(), ["actor.window=0.2"], 0.2),
+        (Investor(), ["actor.choices=9"], 0.0),
+        (Investor(), ["+pirl.actor_rule.steps=2"], 0.0),  # a tanh output
+        (Sprint(), [], 0.0),  # the noise does not depend on the control
+        (Gusty(), [], 0.0),  # five levels
+        (Bicycle(), [], 0.0),
+        (Steered(), [], 0.0),
+    ],
+)
+def test_the_actor_takes_the_mean_of_near_levels_where_the_best_noise_lies_between_the_bounds(problem, typed, window):
+    config = compose("train", ["+experiment=reach1d", *typed])
+    choose_actor(config, problem)
+    assert config.actor.window == window
+    assert build(config.actor, "actor", problem=problem)(torch.ones(1, 1), problem.states.sample(1)).isfinite().all()
 
 
 def test_a_look_ahead_tries_whole_controls_where_the_best_one_jumps():

@@ -113,6 +113,7 @@ def dubins(tmp_path_factory) -> tuple[Solution, Path]:
         solution_of(Reach1D(), hidden=()),
         solution_of(PlanarQuadrotor(), actor={"choices": 5}),
         solution_of(PlanarQuadrotor(), actor={"choices": 3, "together": 2}),
+        solution_of(PlanarQuadrotor(), actor={"choices": 33, "window": 0.5}),
         solution_of(ZermeloBoat(), actor={"log_levels": True}),
     ],
     ids=[
@@ -124,6 +125,7 @@ def dubins(tmp_path_factory) -> tuple[Solution, Path]:
         "no avoid set",
         "choices",
         "together",
+        "window",
         "logarithms",
     ],
 )

@@ -9,7 +9,7 @@ import torch
 from oracles import name
 
 from pirl_rl.errors import ArgumentError
-from pirl_rl.layers import Choice, Dense, LogLevels, Periodic, Scaling
+from pirl_rl.layers import Choice, Dense, LogLevels, Periodic, Scaling, WindowedChoice
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.problems import DubinsCar, HalfSpace, Pendulum, Reach1D, ZermeloBoat
 
@@ -111,6 +111,62 @@ def test_coordinates_together_that_are_refused():
 def test_choices_that_are_refused(choices):
     with pytest.raises(ArgumentError, match=f"choices: expected an integer of at least 2, got {choices}"):
         Choice(choices)
+
+
+def scores_of(shares):
+    """Scores (1, 5) of five numbers, -1 to 1, whose softmax has these shares."""
+    return torch.tensor([shares]).log()
+
+
+@pytest.mark.parametrize(
+    ("shares", "window", "output"),
+    [
+        ([0.45, 0.1, 0.0, 0.1, 0.35], 0.5, -0.5 / 0.55),
+        ([0.3, 0.05, 0.0, 0.3, 0.35], 0.5, 0.5 / 0.65),
+        ([0.3, 0.4, 0.3, 0.0, 0.0], 0.5, -0.5),
+        ([0.3, 0.05, 0.0, 0.3, 0.35], 2.0, 0.175),  # the mean of all
+        ([0.3, 0.05, 0.0, 0.3, 0.35], 0.1, 1.0),  # the best alone
+    ],
+)
+def test_a_windowed_choice_is_the_mean_of_the_numbers_in_the_window_with_the_largest_share(shares, window, output):
+    layer = WindowedChoice(5, window)
+    assert layer(scores_of(shares) + 7.0).item() == pytest.approx(output, abs=1e-6)
+    assert layer(scores_of(shares[::-1])).item() == pytest.approx(-output, abs=1e-6)
+
+
+def test_a_windowed_choice_jumps_between_bounds_over_all_numbers_between_them():
+    """From one bound to the other a hyperbolic tangent passes through 0."""
+    share = torch.linspace(0.01, 0.99, 99)
+    scores = torch.stack([share.log(), torch.full_like(share, -30.0), (1 - share).log()], -1)
+    output = WindowedChoice(3, 0.5)(scores).squeeze(-1)
+    assert output.abs().min() > 0.999
+    assert (output.diff().abs() > 1).sum() == 1
+
+
+def test_a_windowed_choice_follows_the_scores_smoothly_within_a_window():
+    numbers, middle = torch.linspace(-1, 1, 33), torch.linspace(-0.5, 0.5, 101)
+    output = WindowedChoice(33, 0.5)(-((numbers - middle.unsqueeze(-1)) ** 2) / 0.02).squeeze(-1)
+    torch.testing.assert_close(output, middle, atol=0.01, rtol=0)
+    assert output.diff().max() < 0.03
+
+
+def test_an_actor_with_a_window_has_groups_of_scores():
+    torch.manual_seed(0)
+    actor = Actor(HalfSpace(dim=3), (16,), choices=9, window=0.5)
+    tau, x = torch.rand(200, 1), torch.randn(200, 3)
+    action, scores = actor(tau, x), actor.logits(tau, x)
+    assert (action.shape, scores.shape) == ((200, 3), (200, 27))
+    assert action.abs().max() <= 1
+    assert len(action.unique()) > 500
+    torch.testing.assert_close(action[:, 1:2], actor.choice(scores[:, 9:18]))
+
+
+@pytest.mark.parametrize("settings", [{}, {"choices": 3, "together": 3}])
+def test_windows_that_are_refused(settings):
+    with pytest.raises(ArgumentError, match=r"window: expected choices beside it, and together=1, got window=0\.5"):
+        Actor(HalfSpace(dim=3), window=0.5, **settings)
+    with pytest.raises(ArgumentError, match=r"window: expected a number > 0, got -0\.5"):
+        Actor(HalfSpace(dim=3), choices=5, window=-0.5)
 
 
 @pytest.mark.parametrize("problem", [Reach1D(), ZermeloBoat(), DubinsCar(), Pendulum()], ids=name)

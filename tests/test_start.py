@@ -217,7 +217,14 @@ def test_the_networks_have_the_settings_of_the_run_from_which_they_are(cli, tmp_
     here, there = load_config(run), load_config(other)
     assert here.critic == there.critic
     assert there.actor.choices == "auto"  # the helper of the tests records what it was given
-    assert here.actor == {**there.actor, "spread": 4.0, "choices": None, "together": 1, "log_levels": False}
+    assert here.actor == {
+        **there.actor,
+        "spread": 4.0,
+        "choices": None,
+        "together": 1,
+        "window": 0.0,
+        "log_levels": False,
+    }
 
 
 @pytest.mark.parametrize(
