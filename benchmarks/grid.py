@@ -61,7 +61,7 @@ def closed_forms() -> list[dict[str, Any]]:
     return rows
 
 
-def against_itself(problem: ReachAvoidProblem, points: int, seed: int, rollouts: int = 2_000) -> None:
+def against_itself(problem: ReachAvoidProblem, points: int, seed: int, rollouts: int) -> None:
     """Print V against Monte Carlo of the grid's own policy at 50 states.
 
     V is that of a control that is never held, so that Monte Carlo holds it for a two-thousandth of the horizon.
@@ -92,7 +92,7 @@ def against(
     points: int,
     steps: int | None,
     seed: int,
-    rollouts: int = 400,
+    rollouts: int,
     count: int = 400,
 ) -> None:
     """Print the mean success of a run's policy and of the grid's, at the same states and with the same noise.
@@ -123,12 +123,16 @@ if __name__ == "__main__":
     )
     parser.add_argument("--run", help="compare the policy of this run directory with the grid's")
     parser.add_argument("--seed", type=int, default=0, help="of the states, with --run and --own")
+    parser.add_argument(
+        "--rollouts", type=int, help="paths from each state; 400 with --run, and 2,000 with --own alone"
+    )
     parser.add_argument("--json", type=Path, help="write what is found in one and two dimensions to this file")
     arguments = parser.parse_args()
     if arguments.run:
         problem = own[arguments.own]() if arguments.own else None
-        against(arguments.run, problem, arguments.points, arguments.steps, arguments.seed)
+        paths = arguments.rollouts or 400
+        against(arguments.run, problem, arguments.points, arguments.steps, arguments.seed, paths)
     elif arguments.own:
-        against_itself(own[arguments.own](), arguments.points, arguments.seed)
+        against_itself(own[arguments.own](), arguments.points, arguments.seed, arguments.rollouts or 2_000)
     else:
         save(arguments.json, {}, rows=closed_forms())
