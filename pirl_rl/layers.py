@@ -212,11 +212,11 @@ class Choice(nn.Module):
 
 
 class WindowedChoice(Choice):
-    """For each of m outputs, the median of those of k numbers that lie in one window, by their shares of a softmax.
+    """For each of m outputs, the mean of those of k numbers that lie in one window, by their shares of a softmax.
 
-    The window reaches from a number l_i by w to both sides, and is the one with the largest share. The output is the
-    least number in it up to which half of this share lies. It moves with the scores within a window, and jumps where
-    another window takes over. Unlike a mean it is a bound where the bound has most of the share. It has no gradient.
+    The window reaches from a number l_i by w to both sides, and is the one with the largest share. With the shares p_j
+    of the numbers l_j, the output is sum_j p_j l_j / sum_j p_j over |l_j - l_i| <= w. It changes smoothly with the
+    scores within a window, and jumps where another window takes over. It has no gradient in the scores where it jumps.
 
     Args:
         choices: the number k, at least 2.
@@ -237,5 +237,6 @@ class WindowedChoice(Choice):
         # A little wider than the window, so that rounding does not decide which numbers lie in it.
         wide = self.window + 0.1 / self.choices
         near = ((numbers.unsqueeze(0) - numbers.unsqueeze(1)).abs() <= wide).to(share.dtype)
-        inside = near[(share @ near).argmax(-1)] * share
-        return numbers[(inside.cumsum(-1) < inside.sum(-1, keepdim=True) / 2).sum(-1)]
+        mass, moment = share @ near, (share * numbers) @ near
+        largest = mass.argmax(-1, keepdim=True)
+        return (moment.gather(-1, largest) / mass.gather(-1, largest)).squeeze(-1)

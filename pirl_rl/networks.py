@@ -44,9 +44,9 @@ class Actor(nn.Module):
         together: the number of coordinates of the control that are chosen together, with one score for each combination
             of their numbers. Where the best control changes in several coordinates at once, they then jump along the
             same surface.
-        window: with a number above 0, a coordinate is the median of those of its `choices` numbers that lie so close
-            to the best one, see `WindowedChoice`. Where the best control changes many times in a training, that is the
-            median of those that are alike.
+        window: with a number above 0, a coordinate is the mean of those of its `choices` numbers that lie so close to
+            the best one, see `WindowedChoice`. Where the best control changes many times in a training, that is the
+            mean of those that are alike.
 
     Raises:
         ArgumentError: `activation` is not the name of a layer of `torch.nn`, `spread` is not positive, `log_levels` is

@@ -22,7 +22,7 @@ LEVELS, FINE_LEVELS = 5, 33
 """The numbers of levels of a control where two, its bounds, do not hold the best one, and where five are too few."""
 
 WINDOW = 0.5
-"""How close to the best level others are for a median of them, of a control whose range is [-1, 1]."""
+"""How close to the best level others are for a mean of them, of a control whose range is [-1, 1]."""
 
 COARSE = 0.0005
 """What `LEVELS` may lose on average, as a share of the range of the Hamiltonian, before they are too few."""
@@ -86,15 +86,14 @@ def actor_choices(problem: ReachAvoidProblem) -> int | None:
 
 
 def choice_window(problem: ReachAvoidProblem, levels: int) -> float:
-    """How close to the best of so many levels others are for a median of them, see `pirl_rl.layers.WindowedChoice`.
+    """How close to the best of so many levels others are for a mean of them, see `pirl_rl.layers.WindowedChoice`.
 
     It is 0, and the best level alone is taken, except where sigma depends on u and the best control often lies between
     the bounds. There V is nearly straight where the policy makes strong noise, and bends where it makes weak noise, and
     the best control in turn depends on how V bends. So the best control at a state changes many times in a training. An
     actor that chooses one level ends at one of these controls, and a tanh output at the mean of all. The first is worse
     where the Hamiltonian is concave in u, and the second where it is convex: between two strong noises of opposite
-    signs, as of a share that is bought or sold, lies none. The median of those within a window is good in both cases,
-    and may be a bound.
+    signs, as of a share that is bought or sold, lies none. The mean of those within a window is good in both cases.
 
     Args:
         problem: the physics.

@@ -757,7 +757,7 @@ def test_the_actor_chooses_whole_controls_where_their_combinations_are_few(probl
         (Steered(), [], 0.0),
     ],
 )
-def test_the_actor_takes_the_median_of_near_levels_where_the_best_noise_lies_between_the_bounds(problem, typed, window):
+def test_the_actor_takes_the_mean_of_near_levels_where_the_best_noise_lies_between_the_bounds(problem, typed, window):
     config = compose("train", ["+experiment=reach1d", *typed])
     choose_actor(config, problem)
     assert config.actor.window == window

@@ -121,18 +121,17 @@ def scores_of(shares):
 @pytest.mark.parametrize(
     ("shares", "window", "output"),
     [
-        ([0.45, 0.1, 0.0, 0.1, 0.35], 0.5, -1.0),
-        ([0.3, 0.05, 0.0, 0.3, 0.35], 0.5, 1.0),
-        ([0.2, 0.0, 0.1, 0.5, 0.2], 0.5, 0.5),
+        ([0.45, 0.1, 0.0, 0.1, 0.35], 0.5, -0.5 / 0.55),
+        ([0.3, 0.05, 0.0, 0.3, 0.35], 0.5, 0.5 / 0.65),
         ([0.3, 0.4, 0.3, 0.0, 0.0], 0.5, -0.5),
-        ([0.3, 0.05, 0.0, 0.3, 0.35], 2.0, 0.5),  # the median of all
-        ([0.4, 0.0, 0.0, 0.3, 0.3], 0.1, -1.0),  # the best alone
+        ([0.3, 0.05, 0.0, 0.3, 0.35], 2.0, 0.175),  # the mean of all
+        ([0.3, 0.05, 0.0, 0.3, 0.35], 0.1, 1.0),  # the best alone
     ],
 )
-def test_a_windowed_choice_is_the_median_of_the_numbers_in_the_window_with_the_largest_share(shares, window, output):
+def test_a_windowed_choice_is_the_mean_of_the_numbers_in_the_window_with_the_largest_share(shares, window, output):
     layer = WindowedChoice(5, window)
-    assert layer(scores_of(shares) + 7.0).item() == output
-    assert layer(scores_of(shares[::-1])).item() == -output
+    assert layer(scores_of(shares) + 7.0).item() == pytest.approx(output, abs=1e-6)
+    assert layer(scores_of(shares[::-1])).item() == pytest.approx(-output, abs=1e-6)
 
 
 def test_a_windowed_choice_jumps_between_bounds_over_all_numbers_between_them():
@@ -140,16 +139,15 @@ def test_a_windowed_choice_jumps_between_bounds_over_all_numbers_between_them():
     share = torch.linspace(0.01, 0.99, 99)
     scores = torch.stack([share.log(), torch.full_like(share, -30.0), (1 - share).log()], -1)
     output = WindowedChoice(3, 0.5)(scores).squeeze(-1)
-    assert output.abs().min() == 1
+    assert output.abs().min() > 0.999
     assert (output.diff().abs() > 1).sum() == 1
 
 
-def test_a_windowed_choice_follows_the_scores_within_a_window():
+def test_a_windowed_choice_follows_the_scores_smoothly_within_a_window():
     numbers, middle = torch.linspace(-1, 1, 33), torch.linspace(-0.5, 0.5, 101)
     output = WindowedChoice(33, 0.5)(-((numbers - middle.unsqueeze(-1)) ** 2) / 0.02).squeeze(-1)
-    # The levels are 1/16 apart.
-    torch.testing.assert_close(output, middle, atol=0.04, rtol=0)
-    assert output.diff().max() < 0.07
+    torch.testing.assert_close(output, middle, atol=0.01, rtol=0)
+    assert output.diff().max() < 0.03
 
 
 def test_an_actor_with_a_window_has_groups_of_scores():
@@ -159,6 +157,7 @@ def test_an_actor_with_a_window_has_groups_of_scores():
     action, scores = actor(tau, x), actor.logits(tau, x)
     assert (action.shape, scores.shape) == ((200, 3), (200, 27))
     assert action.abs().max() <= 1
+    assert len(action.unique()) > 500
     torch.testing.assert_close(action[:, 1:2], actor.choice(scores[:, 9:18]))
 
 
