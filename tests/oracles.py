@@ -100,6 +100,43 @@ SHIPPED = [getattr(pirl_rl.problems, name)() for name in pirl_rl.problems.__all_
 PROBLEMS = [*SHIPPED, FullNoise(1, 1, 2), FullNoise(8, 2, 3), Winding()]
 
 
+class Conveyor(ReachAvoidProblem):
+    """The first state must come to 1 before the second leaves (-1, 1), whose noise grows with the speed of the first.
+
+    On a way of the length d at the speed u the noise has the variance (0.2 + 0.1 / u) d. So the full speed, 1, is best,
+    and V is the probability that Brownian motion stays in (-1, 1) for this variance if d <= tau, else 0.
+    """
+
+    horizon = 1.0
+    states, controls = Box([0.0, -1.1], [1.1, 1.1]), Box([0.5], [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.cat([u, torch.zeros_like(u)], -1)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.stack([torch.zeros_like(u), (0.2 * u + 0.1).sqrt()], -2)
+
+    def target_constraints(self, x: Tensor) -> Tensor:
+        return torch.cat([1 - x[..., :1], x[..., 1:].abs() - 1], -1)
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        return 1 - x[..., 1:].abs()
+
+    def exact_value(self, tau: Tensor, x: Tensor) -> Tensor:
+        way, side = 1 - x[..., 0], x[..., 1:]
+        order = torch.arange(1, 80, 2, dtype=x.dtype) * math.pi
+        terms = 4 / order * torch.sin(order * (side + 1) / 2) * torch.exp(-(order**2) * 0.3 * way.unsqueeze(-1) / 8)
+        return torch.where(way <= tau, terms.sum(-1), 0.0)
+
+
+def late_states(problem: ReachAvoidProblem, count: int = 400) -> tuple[Tensor, Tensor]:
+    """Times to go in the second half of the horizon and states outside A and B."""
+    rng = torch.Generator().manual_seed(0)
+    x = problem.states.sample(count, rng, torch.float64)
+    x = x[problem.interior(x)]
+    return problem.horizon * (0.5 + 0.5 * torch.rand(len(x), generator=rng, dtype=x.dtype)), x
+
+
 def name(problem: ReachAvoidProblem) -> str:
     return f"{type(problem).__name__}-{problem.states.dim}"
 

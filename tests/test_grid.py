@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from oracles import Conveyor, late_states
 from torch import Tensor
 
 from benchmarks.kinds import Bicycle, Crosswind, Duffing, Gusty, Loiter, Swingup
@@ -30,7 +31,7 @@ from pirl_rl.problems import (
     Safety1D,
     VehicleDrift3,
 )
-from pirl_rl.scoring.truth import DOUBT, find_truth
+from pirl_rl.scoring.truth import find_truth
 from pirl_rl.structure import is_affine_in
 
 
@@ -101,17 +102,9 @@ class Compass(ReachAvoidProblem):
         return torch.cos(x[..., 0] - self.heading) + 0.99
 
 
-def points(problem: ReachAvoidProblem, count: int = 400) -> tuple[Tensor, Tensor]:
-    """Times to go in the second half of the horizon and states outside A and B."""
-    rng = torch.Generator().manual_seed(0)
-    x = problem.states.sample(count, rng, torch.float64)
-    x = x[problem.interior(x)]
-    return problem.horizon * (0.5 + 0.5 * torch.rand(len(x), generator=rng, dtype=x.dtype)), x
-
-
 def largest_error(problem: ReachAvoidProblem, count: int) -> float:
     solution = GridSolver(problem, points=count, estimate=False).solve()
-    tau, x = points(problem)
+    tau, x = late_states(problem)
     return (solution.value(tau, x) - problem.exact_value(tau, x)).abs().max().item()
 
 
@@ -199,7 +192,7 @@ class Slanted(ReachAvoidProblem):
 def test_a_drift_across_correlated_noise_adds_no_noise():
     """The offsets of the noise are oblique, by six nodes in x_2; jumps of the drift along them would smear V."""
     problem = Slanted()
-    tau, x = points(problem)
+    tau, x = late_states(problem)
     solution = GridSolver(problem, points=(21, 81), estimate=False).solve()
     assert (solution.value(tau, x) - problem.exact_value(tau, x)).abs().max() < 0.02
 
@@ -207,7 +200,7 @@ def test_a_drift_across_correlated_noise_adds_no_noise():
 @pytest.mark.parametrize("problem", [Reach1D(), RadialExit(dim=2)], ids=lambda problem: type(problem).__name__)
 def test_the_estimate_bounds_the_largest_error(problem):
     solution = GridSolver(problem, points=81).solve()
-    tau, x = points(problem)
+    tau, x = late_states(problem)
     error = (solution.value(tau, x) - problem.exact_value(tau, x)).abs()
     assert error.max() <= solution.error(tau, x).max()
     assert solution.largest_error < 0.05
@@ -238,7 +231,7 @@ def test_a_larger_target_never_lowers_the_value():
 def test_degenerate_noise_agrees_with_monte_carlo_of_its_own_policy():
     problem = DoubleIntegrator(position_noise=0.0)
     solution = GridSolver(problem, points=101).solve()
-    tau, x = (values[:100] for values in points(problem))
+    tau, x = (values[:100] for values in late_states(problem))
     played = monte_carlo(problem, solution.policy, tau, x, rollouts=200, dt=0.01)
     # Without noise on the position the scheme is of first order, and its error is that of the estimate. The standard
     # error of one probability is 0.035 at most; that of the mean over 100 states is a tenth of it.
@@ -389,7 +382,7 @@ class Calm(HalfSpace):
 def test_weak_noise_in_three_dimensions_has_its_closed_form():
     """The layer in which V rises from 0 to 1 is as wide as one cell of the coarser mesh."""
     problem, errors = Calm(), []
-    tau, x = points(problem, 1_000)
+    tau, x = late_states(problem, 1_000)
     for count in (17, 25):
         solution = GridSolver(problem, points=count, levels=2, estimate=False).solve()  # a vertex is the best control
         assert solution.split
@@ -427,7 +420,7 @@ class Adrift(ReachAvoidProblem):
 )
 def test_weak_noise_in_fewer_dimensions_has_its_closed_form(problem, count, tolerance):
     """With plain first steps the errors are 0.0036, 0.0014, 0.009 and 0.008."""
-    tau, x = points(problem, 1_000)
+    tau, x = late_states(problem, 1_000)
     solution = GridSolver(problem, points=count).solve()
     assert solution.split
     assert (solution.value(tau, x) - problem.exact_value(tau, x)).abs().mean() < tolerance
@@ -455,7 +448,7 @@ class Belt(ReachAvoidProblem):
 def test_first_steps_end_where_the_noise_covers_four_cells_however_slow_the_drift_is():
     """The belt moves by less than two cells in all. With first steps up to the horizon it is 0.004 and 0.038 off."""
     problem = Belt()
-    tau, x = points(problem, 1_000)
+    tau, x = late_states(problem, 1_000)
     solution = GridSolver(problem, points=61).solve()
     assert solution.split
     error = (solution.value(tau, x) - problem.exact_value(tau, x)).abs()
@@ -583,7 +576,7 @@ class Slit(Reach1D):
 
 
 def test_a_solution_whose_half_mesh_misses_the_target_is_kept_and_its_error_is_unknown(tmp_path):
-    tau, x = points(Slit(), 50)
+    tau, x = late_states(Slit(), 50)
     with pytest.warns(UserWarning, match="the error of the grid is not known, and its estimate is 1"):
         solution = GridSolver(Slit(), points=41).solve()
     assert torch.equal(solution.value(tau, x), GridSolver(Slit(), points=41, estimate=False).solve().value(tau, x))
@@ -660,77 +653,12 @@ def test_a_target_is_resolved_by_four_nodes_in_a_row(problem, count, resolved):
 
 def test_extrapolation_lowers_the_error_of_turns():
     problem = Calm()
-    tau, x = points(problem, 1_000)
+    tau, x = late_states(problem, 1_000)
     solution, exact = GridSolver(problem, points=25, levels=2).solve(), problem.exact_value(tau, x)
     error, estimate = (solution.value(tau, x) - exact).abs(), solution.error(tau, x)
     assert (error <= estimate + 0.03).all()
     solution.coarse = None
     assert error.mean() < 0.6 * (solution.value(tau, x) - exact).abs().mean()
-
-
-class Track(ReachAvoidProblem):
-    """Run to x_1 >= 1 at speed 1; only lanes with |x_2| <= 0.3 end in A, and nobody leaves a lane, so that V jumps."""
-
-    horizon = 2.0
-    states, controls = Box([-1.0] * 3, [1.0] * 3), Box([-1.0], [1.0])
-
-    def drift(self, x: Tensor, u: Tensor) -> Tensor:
-        return torch.stack([torch.ones_like(u[..., 0]), torch.zeros_like(u[..., 0]), u[..., 0]], -1)
-
-    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
-        return x.new_tensor([[0.0], [0.0], [0.1]]).expand(*x.shape, 1)
-
-    def target_constraints(self, x: Tensor) -> Tensor:
-        return torch.stack([1 - x[..., 0], x[..., 1].abs() - 0.3], -1)
-
-    def exact_value(self, tau: Tensor, x: Tensor) -> Tensor:
-        return ((x[..., 1].abs() <= 0.3) & (x[..., 0] + tau >= 1)).to(x.dtype)
-
-
-def test_the_estimate_sees_jumps_that_both_meshes_smear_alike():
-    problem = Track()
-    tau, x = points(problem, 1_000)
-    solution = GridSolver(problem, points=25, levels=2).solve()
-    assert solution.split
-    wrong = (solution.value(tau, x) - problem.exact_value(tau, x)).abs() > 0.1
-    assert wrong.sum() > 50
-    assert (solution.error(tau, x)[wrong] > DOUBT).all()
-    assert (solution._distance(tau, x)[wrong] <= DOUBT).double().mean() > 0.05, "the distance of both would do"
-
-
-class Shear(ReachAvoidProblem):
-    """Run to x_1 >= 1 at speed 1 in lanes with noise of the strength x_2, which nobody leaves."""
-
-    horizon = 2.0
-    states, controls = Box([-1.0, 0.02], [1.0, 1.0]), Box([-1.0], [1.0])
-
-    def drift(self, x: Tensor, u: Tensor) -> Tensor:
-        return torch.stack([1 + 0 * u[..., 0], 0 * x[..., 1]], -1)
-
-    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
-        return torch.stack([x[..., 1], 0 * x[..., 1]], -1).unsqueeze(-1)
-
-    def target_level(self, x: Tensor) -> Tensor:
-        return 1 - x[..., 0]
-
-    def exact_value(self, tau: Tensor, x: Tensor) -> Tensor:
-        return first_passage(tau, 1 - x[..., 0], 1.0, x[..., 1])
-
-
-def test_the_estimate_sees_what_upwind_jumps_smear_where_the_noise_is_weak_in_a_part_of_the_box():
-    problem = Shear()
-    tau, x = points(problem, 2_000)
-    solution = GridSolver(problem, points=41).solve()
-    assert not solution.split
-    error = (solution.value(tau, x) - problem.exact_value(tau, x)).abs()
-    wrong, estimate = error > 0.1, solution.error(tau, x)
-    assert wrong.sum() > 20
-    assert (x[wrong, 1] < 0.2).all()
-    assert (estimate[wrong] > DOUBT).all()
-    assert (solution._distance(tau, x)[wrong] <= DOUBT).double().mean() > 0.05, "the distance of both would do"
-    # Where the noise is stronger than that of the jumps, it is the distance alone.
-    strong = x[:, 1] > 0.3
-    assert (estimate[strong] < DOUBT).double().mean() > 0.9
 
 
 class Hasty(Landfall):
@@ -757,42 +685,13 @@ def test_drift_and_noise_act_in_turns_where_the_noise_is_weak(problem, split):
     assert not GridSolver(problem, points=11, estimate=False, turns=False).solve().split
 
 
-class Conveyor(ReachAvoidProblem):
-    """The first state must come to 1 before the second leaves (-1, 1), whose noise grows with the speed of the first.
-
-    On a way of the length d at the speed u the noise has the variance (0.2 + 0.1 / u) d. So the full speed, 1, is best,
-    and V is the probability that Brownian motion stays in (-1, 1) for this variance if d <= tau, else 0.
-    """
-
-    horizon = 1.0
-    states, controls = Box([0.0, -1.1], [1.1, 1.1]), Box([0.5], [1.0])
-
-    def drift(self, x: Tensor, u: Tensor) -> Tensor:
-        return torch.cat([u, torch.zeros_like(u)], -1)
-
-    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
-        return torch.stack([torch.zeros_like(u), (0.2 * u + 0.1).sqrt()], -2)
-
-    def target_constraints(self, x: Tensor) -> Tensor:
-        return torch.cat([1 - x[..., :1], x[..., 1:].abs() - 1], -1)
-
-    def avoid_constraints(self, x: Tensor) -> Tensor:
-        return 1 - x[..., 1:].abs()
-
-    def exact_value(self, tau: Tensor, x: Tensor) -> Tensor:
-        way, side = 1 - x[..., 0], x[..., 1:]
-        order = torch.arange(1, 80, 2, dtype=x.dtype) * math.pi
-        terms = 4 / order * torch.sin(order * (side + 1) / 2) * torch.exp(-(order**2) * 0.3 * way.unsqueeze(-1) / 8)
-        return torch.where(way <= tau, terms.sum(-1), 0.0)
-
-
 @pytest.mark.parametrize(("count", "mean", "largest"), [(61, 0.004, 0.03), (121, 0.001, 0.01)])
 def test_noise_that_depends_on_the_control_acts_in_turns_with_the_drift(count, mean, largest):
     """V jumps where the way is tau. If both act together it is smeared, and with 61 nodes wrong by up to 0.34 at these
     states. The policy is judged where V is below 1, since elsewhere slower controls are as good."""
     problem = Conveyor()
     solution = GridSolver(problem, count, estimate=False).solve()
-    tau, x = points(problem)
+    tau, x = late_states(problem)
     away = (1 - x[:, 0] - tau).abs() > 0.05
     exact = problem.exact_value(tau, x)
     error = (solution.value(tau, x) - exact).abs()[away]
@@ -810,7 +709,7 @@ def dubins() -> GridSolution:
 def test_the_dubins_car_agrees_with_monte_carlo_of_its_own_policy(dubins):
     """With 400 paths from each of 100 states a perfect V would have about 0.008."""
     problem, solution = dubins.problem, dubins
-    tau, x = (values[:100] for values in points(problem))
+    tau, x = (values[:100] for values in late_states(problem))
     played = monte_carlo(problem, solution.policy, tau, x, rollouts=400, dt=0.02)
     assert (solution.value(tau, x) - played.probability).abs().mean() < 0.035
 
@@ -850,7 +749,7 @@ def test_noise_two_integrators_away_agrees_with_monte_carlo_of_its_own_policy():
     steps are too long for drift and noise to act in turns.
     """
     problem, distances = Crosswind(), {}
-    tau, x = (values[:100] for values in points(problem))
+    tau, x = (values[:100] for values in late_states(problem))
     for steps in (None, 21):
         solution = GridSolver(problem, points=21, steps=steps, estimate=False).solve()
         played = monte_carlo(problem, solution.policy, tau, x, rollouts=100, dt=0.025)

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from pirl_rl.errors import ArgumentError, CheckpointError
 from pirl_rl.files import replacing
+from pirl_rl.grid.estimate import estimate
 from pirl_rl.grid.faces import mean_beyond_faces
 from pirl_rl.grid.field import Field
 from pirl_rl.grid.mesh import Mesh
-from pirl_rl.grid.transport import WEAK
 from pirl_rl.problem import ReachAvoidProblem
 
 SMALLEST = 1e-6
@@ -197,16 +197,11 @@ class GridSolution:
         return torch.from_numpy(self._controls[self._policy[level, place], place]).to(x)
 
     def error(self, tau: Tensor, x: Tensor) -> Tensor:
-        """An estimate (P,) of the error: the distance of V from that with half as many points and steps.
+        """An estimate (P,) of the error, see `pirl_rl.grid.estimate`.
 
-        The scheme is of first order or better, so that the distance is at least about the error of the fine solution,
-        and well above that of the extrapolated `value` where the order is 1. In cells that a face cuts V may rise from
-        the face within a layer that is thinner than the cell. Where V is linear in such cells, both solutions are near
-        the value of the set close to the face, and so the largest of the distances at x and at the corners counts.
-        Where drift and noise act in turns, V may jump, and both solutions smear a jump alike. Large second differences
-        of V show this, and count where they are larger than the distance. Where they act at once, and the scheme adds
-        more noise than there is, both solutions smear V alike too, and its deviation under the added noise counts. What
-        neither can show is added, see `unseen`.
+        It starts from the distance of V from that with half as many points and steps. The scheme is of first order or
+        better, so that the distance is at least about the error of the fine solution, and well above that of the
+        extrapolated `value` where the order is 1. What the coarse solution cannot show is added, see `unseen`.
 
         Raises:
             ArgumentError: the solution was computed without an estimate, or a tau is outside [0, horizon].
@@ -214,52 +209,11 @@ class GridSolution:
         if self.coarse is None and self.unseen is None:
             raise ArgumentError("error: expected a solution with an estimate, got one of GridSolver(estimate=False)")
         x = self.problem.states.wrap(x)
-        error = torch.zeros_like(tau, dtype=x.dtype) if self.coarse is None else self._seen(tau, x)
+        error = torch.zeros_like(tau, dtype=x.dtype) if self.coarse is None else estimate(self, tau, x)
         if self.unseen is not None:
             nodes, weights = self.mesh.corners(x.detach().double().cpu().numpy())
             error = error + torch.from_numpy((weights * self.unseen[nodes]).sum(0)).to(error)
         return error.clamp(max=1)
-
-    def _seen(self, tau: Tensor, x: Tensor) -> Tensor:
-        """The part (P,) of `error` that both solutions show, at states (P, n) within their periods."""
-        error = self._distance(tau, x)
-        if self.split:
-            return torch.maximum(error, self._bend(tau, x))
-        cut = ~self.coarse.field.uncut(x)  # type: ignore[union-attr]
-        for nodes in self.mesh.corners(x[cut].detach().double().cpu().numpy())[0]:
-            corners = torch.from_numpy(self.mesh.states(self.mesh.indices()[nodes])).to(x)
-            distance = self._distance(tau[cut], corners).where(self.problem.interior(corners), 0.0)
-            error[cut] = torch.maximum(error[cut], distance)
-        return torch.maximum(error, self._smear(tau, x))
-
-    def _distance(self, tau: Tensor, x: Tensor) -> Tensor:
-        """The distance (P,) of the interpolated V from that of the coarse solution."""
-        return (self.field(tau, x) - self.coarse.field(tau, x)).abs()  # type: ignore[union-attr]
-
-    def _smear(self, tau: Tensor, x: Tensor) -> Tensor:
-        """The deviation (P,) of V under the noise that the scheme adds, where along the slope of V it is the stronger.
-
-        Upwind jumps along axis i, with nodes h_i apart, add noise of the variance h_i |f_i| per unit of time, and
-        implicit steps of the length dt add (f dt)^2 in each of them.
-        """
-        control, slope = self.policy(tau, x), self.gradient(tau, x)
-        drift, sigma = self.problem.drift(x, control), self.problem.diffusion(x, control)
-        jumps = (torch.as_tensor(self.mesh.spacing).to(x) * drift.abs() * slope.square()).sum(-1)
-        noise = (sigma * slope.unsqueeze(-1)).sum(-2).square().sum(-1)
-        # The steps are equidistant in sqrt(tau).
-        dt = 2 * (tau * self.problem.horizon).sqrt() / self.steps
-        deviation = (tau * (jumps + dt * (drift * slope).sum(-1).square())).sqrt()
-        # Inside a set the physics may have no number, and there V is known.
-        return deviation.where(jumps > WEAK * noise, 0.0).nan_to_num(0.0)
-
-    def _bend(self, tau: Tensor, x: Tensor) -> Tensor:
-        """The largest second difference (P,) of V, of those along the axes at x and one cell beside it."""
-        largest = torch.zeros_like(tau, dtype=x.dtype)
-        for step in torch.diag(torch.as_tensor(self.mesh.spacing).to(x)):
-            line = [self.field(tau, self.problem.states.wrap(x + k * step)) for k in range(-2, 3)]
-            for behind, middle, ahead in zip(line, line[1:], line[2:], strict=False):
-                largest = torch.maximum(largest, (ahead - 2 * middle + behind).abs())
-        return largest
 
     @property
     def largest_error(self) -> float:
