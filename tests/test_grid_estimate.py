@@ -8,11 +8,17 @@ from oracles import Conveyor, late_states
 from torch import Tensor
 
 from pirl_rl import Box, ReachAvoidProblem
-from pirl_rl.grid import GridSolver
-from pirl_rl.grid.estimate import distance, local
+from pirl_rl.grid import GridSolution, GridSolver
+from pirl_rl.grid.estimate import Estimate
 from pirl_rl.passages import first_passage
 from pirl_rl.problems import HalfSpace
 from pirl_rl.scoring.truth import DOUBT
+
+
+def parts(solution: GridSolution) -> Estimate:
+    """The estimate of a solution, with its parts."""
+    assert solution.coarse is not None
+    return Estimate(solution.field, solution.coarse.field, solution.split, solution.policy, solution.gradient)
 
 
 class Track(ReachAvoidProblem):
@@ -42,7 +48,7 @@ def test_the_estimate_sees_jumps_that_both_meshes_smear_alike():
     wrong = (solution.value(tau, x) - problem.exact_value(tau, x)).abs() > 0.1
     assert wrong.sum() > 50
     assert (solution.error(tau, x)[wrong] > DOUBT).all()
-    assert (distance(solution, tau, x)[wrong] <= DOUBT).double().mean() > 0.05, "the distance of both would do"
+    assert (parts(solution).distance(tau, x)[wrong] <= DOUBT).double().mean() > 0.05, "the distance of both would do"
 
 
 class Shear(ReachAvoidProblem):
@@ -74,10 +80,10 @@ def test_the_estimate_sees_what_upwind_jumps_smear_where_the_noise_is_weak_in_a_
     assert wrong.sum() > 20
     assert (x[wrong, 1] < 0.2).all()
     assert (estimate[wrong] > DOUBT).all()
-    assert (distance(solution, tau, x)[wrong] <= DOUBT).double().mean() > 0.05, "the distance of both would do"
+    assert (parts(solution).distance(tau, x)[wrong] <= DOUBT).double().mean() > 0.05, "the distance of both would do"
     # Where the noise is stronger than that of the jumps, it is the distance alone.
     strong = x[:, 1] > 0.3
-    assert (local(solution, tau, x)[strong] < DOUBT).double().mean() > 0.9
+    assert (parts(solution).at(tau, x)[strong] < DOUBT).double().mean() > 0.9
 
 
 @pytest.mark.parametrize("count", [41, 61])
@@ -88,7 +94,7 @@ def test_the_estimate_sees_the_middle_of_a_jump_between_nodes(count):
     tau, x = late_states(problem, 4_000)
     solution = GridSolver(problem, count).solve()
     error = (solution.value(tau, x) - problem.exact_value(tau, x)).abs()
-    assert error[local(solution, tau, x) <= DOUBT].max() > 0.06
+    assert error[parts(solution).at(tau, x) <= DOUBT].max() > 0.06
     assert error[solution.error(tau, x) <= DOUBT].max() < 0.03
 
 
@@ -96,5 +102,5 @@ def test_the_estimate_of_smooth_values_is_that_of_single_states():
     problem = HalfSpace(dim=2)
     tau, x = late_states(problem, 1_000)
     solution = GridSolver(problem, points=41).solve()
-    assert solution.error(tau, x).mean() < 1.5 * local(solution, tau, x).mean()
-    assert (solution.error(tau, x) >= local(solution, tau, x)).all()
+    assert solution.error(tau, x).mean() < 1.5 * parts(solution).at(tau, x).mean()
+    assert (solution.error(tau, x) >= parts(solution).at(tau, x)).all()

@@ -12,83 +12,88 @@ have in common does not show in it, and each of the other parts looks for one su
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from pirl_rl.arguments import Policy
+from pirl_rl.grid.field import Field
 from pirl_rl.grid.transport import WEAK
-
-if TYPE_CHECKING:
-    from pirl_rl.grid.solution import GridSolution
 
 NEIGHBOURHOOD = 2
 """The half width of the neighbourhood whose largest estimate counts, in cells: one cell of the coarse mesh."""
 
 
-def estimate(solution: GridSolution, tau: Tensor, x: Tensor) -> Tensor:
-    """The largest (P,) of the local estimates at x and, along each axis, one cell of the coarse mesh to both sides.
+@dataclass(frozen=True)
+class Estimate:
+    """The estimate (P,) as a function of times to go tau (P,), in s, and of states x (P, n) within their periods.
 
-    Args:
-        solution: the solution, which has a coarse one.
-        tau: times to go (P,), in s.
-        x: states (P, n) within their periods.
+    Attributes:
+        fine: V of the solution.
+        coarse: V with half as many points and steps.
+        turns: whether drift and noise acted in turns.
+        policy: that of the solution.
+        gradient: maps tau and x to the gradient (P, n) of V in x, per unit of the state.
     """
-    problem, error = solution.problem, local(solution, tau, x)
-    for step in _along_axes(solution, x):
-        for beside in (x - NEIGHBOURHOOD * step, x + NEIGHBOURHOOD * step):
-            y = problem.states.wrap(beside)
-            error = torch.maximum(error, local(solution, tau, y).where(problem.interior(y), 0.0))
-    return error
 
+    fine: Field
+    coarse: Field
+    turns: bool
+    policy: Policy
+    gradient: Callable[[Tensor, Tensor], Tensor]
 
-def local(solution: GridSolution, tau: Tensor, x: Tensor) -> Tensor:
-    """The largest (P,) of the parts of the estimate at x alone. Arguments are those of `estimate`."""
-    error = distance(solution, tau, x)
-    if solution.split:
-        return torch.maximum(error, bend(solution, tau, x))
-    cut = ~solution.coarse.field.uncut(x)  # type: ignore[union-attr]
-    mesh = solution.mesh
-    for nodes in mesh.corners(x[cut].detach().double().cpu().numpy())[0]:
-        corners = torch.from_numpy(mesh.states(mesh.indices()[nodes])).to(x)
-        apart = distance(solution, tau[cut], corners).where(solution.problem.interior(corners), 0.0)
-        error[cut] = torch.maximum(error[cut], apart)
-    return torch.maximum(error, smear(solution, tau, x))
+    def __call__(self, tau: Tensor, x: Tensor) -> Tensor:
+        """The largest of the estimates at x and, along each axis, one cell of the coarse mesh to both sides."""
+        problem, error = self.fine.problem, self.at(tau, x)
+        for step in self._along_axes(x):
+            for beside in (x - NEIGHBOURHOOD * step, x + NEIGHBOURHOOD * step):
+                y = problem.states.wrap(beside)
+                error = torch.maximum(error, self.at(tau, y).where(problem.interior(y), 0.0))
+        return error
 
+    def at(self, tau: Tensor, x: Tensor) -> Tensor:
+        """The largest (P,) of the parts of the estimate at x alone."""
+        error = self.distance(tau, x)
+        if self.turns:
+            return torch.maximum(error, self.bend(tau, x))
+        cut, mesh = ~self.coarse.uncut(x), self.fine.mesh
+        for nodes in mesh.corners(x[cut].detach().double().cpu().numpy())[0]:
+            corners = torch.from_numpy(mesh.states(mesh.indices()[nodes])).to(x)
+            distance = self.distance(tau[cut], corners).where(self.fine.problem.interior(corners), 0.0)
+            error[cut] = torch.maximum(error[cut], distance)
+        return torch.maximum(error, self.smear(tau, x))
 
-def distance(solution: GridSolution, tau: Tensor, x: Tensor) -> Tensor:
-    """The distance (P,) of the interpolated V from that of the coarse solution."""
-    return (solution.field(tau, x) - solution.coarse.field(tau, x)).abs()  # type: ignore[union-attr]
+    def distance(self, tau: Tensor, x: Tensor) -> Tensor:
+        """The distance (P,) of the interpolated V from that of the coarse solution."""
+        return (self.fine(tau, x) - self.coarse(tau, x)).abs()
 
+    def smear(self, tau: Tensor, x: Tensor) -> Tensor:
+        """The deviation (P,) of V under the noise that the scheme adds, where along the slope of V it is the stronger.
 
-def smear(solution: GridSolution, tau: Tensor, x: Tensor) -> Tensor:
-    """The deviation (P,) of V under the noise that the scheme adds, where along the slope of V it is the stronger.
+        Upwind jumps along axis i, with nodes h_i apart, add noise of the variance h_i |f_i| per unit of time, and
+        implicit steps of the length dt add (f dt)^2 in each of them.
+        """
+        problem, control, slope = self.fine.problem, self.policy(tau, x), self.gradient(tau, x)
+        drift, sigma = problem.drift(x, control), problem.diffusion(x, control)
+        jumps = (torch.as_tensor(self.fine.mesh.spacing).to(x) * drift.abs() * slope.square()).sum(-1)
+        noise = (sigma * slope.unsqueeze(-1)).sum(-2).square().sum(-1)
+        # The steps are equidistant in sqrt(tau).
+        dt = 2 * (tau * problem.horizon).sqrt() / (len(self.fine.values) - 1)
+        deviation = (tau * (jumps + dt * (drift * slope).sum(-1).square())).sqrt()
+        # Inside a set the physics may have no number, and there V is known.
+        return deviation.where(jumps > WEAK * noise, 0.0).nan_to_num(0.0)
 
-    Upwind jumps along axis i, with nodes h_i apart, add noise of the variance h_i |f_i| per unit of time, and implicit
-    steps of the length dt add (f dt)^2 in each of them.
-    """
-    problem, control, slope = solution.problem, solution.policy(tau, x), solution.gradient(tau, x)
-    drift, sigma = problem.drift(x, control), problem.diffusion(x, control)
-    jumps = (torch.as_tensor(solution.mesh.spacing).to(x) * drift.abs() * slope.square()).sum(-1)
-    noise = (sigma * slope.unsqueeze(-1)).sum(-2).square().sum(-1)
-    # The steps are equidistant in sqrt(tau).
-    dt = 2 * (tau * problem.horizon).sqrt() / solution.steps
-    deviation = (tau * (jumps + dt * (drift * slope).sum(-1).square())).sqrt()
-    # Inside a set the physics may have no number, and there V is known.
-    return deviation.where(jumps > WEAK * noise, 0.0).nan_to_num(0.0)
+    def bend(self, tau: Tensor, x: Tensor) -> Tensor:
+        """The largest second difference (P,) of V, of those along the axes at x and one cell beside it."""
+        largest, wrap = torch.zeros_like(tau, dtype=x.dtype), self.fine.problem.states.wrap
+        for step in self._along_axes(x):
+            line = [self.fine(tau, wrap(x + k * step)) for k in range(-2, 3)]
+            for behind, middle, ahead in zip(line, line[1:], line[2:], strict=False):
+                largest = torch.maximum(largest, (ahead - 2 * middle + behind).abs())
+        return largest
 
-
-def bend(solution: GridSolution, tau: Tensor, x: Tensor) -> Tensor:
-    """The largest second difference (P,) of V, of those along the axes at x and one cell beside it."""
-    field, wrap = solution.field, solution.problem.states.wrap
-    largest = torch.zeros_like(tau, dtype=x.dtype)
-    for step in _along_axes(solution, x):
-        line = [field(tau, wrap(x + k * step)) for k in range(-2, 3)]
-        for behind, middle, ahead in zip(line, line[1:], line[2:], strict=False):
-            largest = torch.maximum(largest, (ahead - 2 * middle + behind).abs())
-    return largest
-
-
-def _along_axes(solution: GridSolution, x: Tensor) -> Tensor:
-    """The steps (n, n) from a node to the next one along each axis."""
-    return torch.diag(torch.as_tensor(solution.mesh.spacing).to(x))
+    def _along_axes(self, x: Tensor) -> Tensor:
+        """The steps (n, n) from a node to the next one along each axis."""
+        return torch.diag(torch.as_tensor(self.fine.mesh.spacing).to(x))

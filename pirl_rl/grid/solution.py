@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pirl_rl.errors import ArgumentError, CheckpointError
 from pirl_rl.files import replacing
-from pirl_rl.grid.estimate import estimate
+from pirl_rl.grid.estimate import Estimate
 from pirl_rl.grid.faces import mean_beyond_faces
 from pirl_rl.grid.field import Field
 from pirl_rl.grid.mesh import Mesh
@@ -208,8 +208,9 @@ class GridSolution:
         """
         if self.coarse is None and self.unseen is None:
             raise ArgumentError("error: expected a solution with an estimate, got one of GridSolver(estimate=False)")
-        x = self.problem.states.wrap(x)
-        error = torch.zeros_like(tau, dtype=x.dtype) if self.coarse is None else estimate(self, tau, x)
+        x, error = self.problem.states.wrap(x), torch.zeros_like(tau, dtype=x.dtype)
+        if self.coarse is not None:
+            error = Estimate(self.field, self.coarse.field, self.split, self.policy, self.gradient)(tau, x)
         if self.unseen is not None:
             nodes, weights = self.mesh.corners(x.detach().double().cpu().numpy())
             error = error + torch.from_numpy((weights * self.unseen[nodes]).sum(0)).to(error)
