@@ -6,6 +6,7 @@ from benchmarks.kinds.cycles import JetLag, PowerSwing, Runaway, Searchlight
 from benchmarks.kinds.demands import Backburn, ChemoWard, IslandGrid, VaccineStock
 from benchmarks.kinds.flights import Descent, Encounter
 from benchmarks.kinds.journeys import Barge, Scooter, SolarCar
+from benchmarks.kinds.lines import Casino, Gene, Tightrope, Uphill, Washboard
 from benchmarks.kinds.markets import Endowment, Granary, PairTrade
 from benchmarks.kinds.masses import Crosswind, Gusty, Lander, Orbit, Servo, Sprint, VanDerPol
 from benchmarks.kinds.mixtures import Bearing, Mirror, Mixture
@@ -26,6 +27,6 @@ KINDS += (Bearing, Mirror, Duffing, MountainCar, Swingup, Pursuit, Rooms, Anaest
 KINDS += (LotkaVolterra, Chain, Unicycle, Rendezvous, FastRiver, Glider, Reactor, Fishery)
 KINDS += (VaccineStock, Backburn, ChemoWard, IslandGrid, StraitFerry, QuietStance, LynxAndHare, HerdImmunity)
 KINDS += (TackingYacht, Encounter, Descent, Gantry, Endowment, Granary, PairTrade, Chemostat)
-KINDS += (SolarCar, Scooter, Barge)
+KINDS += (SolarCar, Scooter, Barge, Tightrope, Casino, Washboard, Uphill, Gene)
 
 PROBLEMS = {kind.__name__: kind for kind in KINDS} | OTHERS
