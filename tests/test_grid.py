@@ -16,7 +16,7 @@ from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.grid import GridSolution, GridSolver
 from pirl_rl.grid.candidates import candidates
-from pirl_rl.grid.mesh import default_margin
+from pirl_rl.grid.mesh import default_margin, make_mesh, widest_margin
 from pirl_rl.passages import first_passage
 from pirl_rl.payoffs import LipschitzPayoff
 from pirl_rl.problems import (
@@ -891,3 +891,31 @@ def test_a_margin_does_not_lengthen_a_period():
     tau = torch.ones(len(x), dtype=torch.float64)
     plain, wide = (GridSolver(problem, 81, margin=margin).solve().value(tau, x) for margin in (None, [0.3]))
     assert torch.equal(plain, wide)
+
+
+class Tilting(ReachAvoidProblem):
+    """Three states with bounds that nodes meet, up to rounding, and beyond which lies the avoid set."""
+
+    objective = "invariance"
+    horizon = 4.0
+    states, controls = Box([-0.5, -2.5, -2.0], [0.5, 2.5, 2.0]), Box([-1.0], [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.stack([x[..., 1], u[..., 0], u[..., 0]], -1)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return x.new_tensor([[0.0], [1.0], [0.0]]).expand(*x.shape, 1)
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        return 1 - (x / x.new_tensor([0.5, 2.5, 2.0])).abs()
+
+
+@pytest.mark.parametrize("points", [9, 16, 21, 26, 41])
+def test_a_wider_margin_leaves_a_mesh_as_it_is_where_all_beyond_it_is_in_a_set(points):
+    """Also where nodes lie on the faces: they are the same ones to the last bit, whatever the margin is."""
+    problem, meshes = Tilting(), []
+    for margin in (widest_margin(problem), 2 * widest_margin(problem), 0.13 * widest_margin(problem)):
+        meshes.append(make_mesh(problem, (points,) * 3, margin))
+    assert len({mesh.shape for mesh in meshes}) == 1
+    nodes = [mesh.states(mesh.indices()) for mesh in meshes]
+    assert all(np.array_equal(other, nodes[0]) for other in nodes)

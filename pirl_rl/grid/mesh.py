@@ -35,17 +35,34 @@ their difference is small and says nothing.
 class Mesh:
     """Equidistant nodes, ordered with the last axis fastest.
 
+    Meshes with the same origin and spacing have the same nodes to the last bit where they overlap, so that a node on a
+    face of A or B is on the same side of it in both.
+
     Args:
-        low: the first node (n,), in SI units.
+        origin: a point of the lattice (n,), in SI units.
         spacing: distance of neighbours along each axis (n,), in SI units.
         shape: number of nodes along each axis (n,).
         periodic: axes along which the first node follows the last one.
+        first: whole number of nodes from the origin to the first one, along each axis (n,).
     """
 
-    def __init__(self, low: np.ndarray, spacing: np.ndarray, shape: Sequence[int], periodic: Sequence[int] = ()):
-        self.low, self.spacing = low, spacing
+    def __init__(
+        self,
+        origin: np.ndarray,
+        spacing: np.ndarray,
+        shape: Sequence[int],
+        periodic: Sequence[int] = (),
+        first: np.ndarray | int = 0,
+    ):
+        self.origin, self.spacing = origin, spacing
+        self.first = np.broadcast_to(first, origin.shape)
         self.shape = tuple(int(count) for count in shape)
         self.periodic = tuple(periodic)
+
+    @property
+    def low(self) -> np.ndarray:
+        """The first node (n,), in SI units."""
+        return self.origin + self.spacing * self.first
 
     @property
     def size(self) -> int:
@@ -61,7 +78,7 @@ class Mesh:
         indices = indices.astype(float)
         for axis in self.periodic:
             indices[..., axis] %= self.shape[axis]
-        return self.low + self.spacing * indices
+        return self.origin + self.spacing * (self.first + indices)
 
     def flat(self, indices: np.ndarray) -> np.ndarray:
         """The numbers (*) of the nodes at whole indices (*, n), wrapped or put on the edge."""
@@ -129,7 +146,7 @@ def make_mesh(problem: ReachAvoidProblem, points: Sequence[int], margin: np.ndar
     for axis in set(axes) - set(wide.periodic):
         inside = np.flatnonzero(free.any(tuple(other for other in axes if other != axis)))
         first[axis], last[axis] = max(inside[0] - 1, 0), min(inside[-1] + 1, last[axis])
-    return Mesh(wide.low + first * wide.spacing, wide.spacing, (last - first + 1).tolist(), wide.periodic)
+    return Mesh(wide.origin, wide.spacing, (last - first + 1).tolist(), wide.periodic, wide.first + first)
 
 
 def resolves_target(problem: ReachAvoidProblem, points: Sequence[int], margin: np.ndarray) -> bool:
@@ -161,4 +178,4 @@ def _wide(problem: ReachAvoidProblem, points: Sequence[int], margin: np.ndarray)
     periodic, count = tuple(problem.states.periodic), np.array(points)
     spacing = width / np.where(np.isin(np.arange(len(low)), periodic), count, count - 1)
     extra = np.ceil(margin / spacing - 1e-9).astype(int)
-    return Mesh(low - extra * spacing, spacing, (count + 2 * extra).tolist(), periodic)
+    return Mesh(low, spacing, (count + 2 * extra).tolist(), periodic, -extra)

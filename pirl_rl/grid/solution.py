@@ -108,7 +108,8 @@ class GridSolution:
         """All numbers that the policy and V are computed from, by name."""
         mesh = self.mesh
         arrays = {
-            "low": mesh.low,
+            "origin": mesh.origin,
+            "first": mesh.first,
             "spacing": mesh.spacing,
             "shape": np.array(mesh.shape),
             "periodic": np.array(mesh.periodic, int),
@@ -125,12 +126,14 @@ class GridSolution:
 
     @classmethod
     def _of(cls, problem: ReachAvoidProblem, arrays: Mapping[str, np.ndarray], prefix: str) -> GridSolution:
-        low, spacing, shape, periodic = (arrays[prefix + name] for name in ("low", "spacing", "shape", "periodic"))
+        spacing, shape, periodic = (arrays[prefix + name] for name in ("spacing", "shape", "periodic"))
         values, policy, controls, nearest = (
             arrays[prefix + name] for name in ("values", "policy", "controls", "nearest")
         )
-        mesh = Mesh(low, spacing, shape.tolist(), periodic.tolist())
-        split = bool(arrays.get(f"{prefix}split", False))  # files of earlier versions lack it
+        # Files of earlier versions have the first node alone, as "low", and do not say whether parts acted in turns.
+        origin = arrays[f"{prefix}origin" if f"{prefix}origin" in arrays else f"{prefix}low"]
+        mesh = Mesh(origin, spacing, shape.tolist(), periodic.tolist(), arrays.get(f"{prefix}first", 0))
+        split = bool(arrays.get(f"{prefix}split", False))
         unseen = arrays.get(f"{prefix}unseen")
         return cls(problem, mesh, values, policy, controls, nearest, split=split, unseen=unseen)
 
