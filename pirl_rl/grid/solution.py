@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -209,11 +209,16 @@ class GridSolution:
         Raises:
             ArgumentError: the solution was computed without an estimate, or a tau is outside [0, horizon].
         """
+        return self._error(tau, self.problem.states.wrap(x), Estimate.__call__)
+
+    def _error(self, tau: Tensor, x: Tensor, part: Callable[[Estimate, Tensor, Tensor], Tensor]) -> Tensor:
+        """`error` at states (P, n) within their periods, with the given part of the estimate."""
         if self.coarse is None and self.unseen is None:
             raise ArgumentError("error: expected a solution with an estimate, got one of GridSolver(estimate=False)")
-        x, error = self.problem.states.wrap(x), torch.zeros_like(tau, dtype=x.dtype)
+        error = torch.zeros_like(tau, dtype=x.dtype)
         if self.coarse is not None:
-            error = Estimate(self.field, self.coarse.field, self.split, self.policy, self.gradient)(tau, x)
+            estimate = Estimate(self.field, self.coarse.field, self.split, self.policy, self.gradient)
+            error = part(estimate, tau, x)
         if self.unseen is not None:
             nodes, weights = self.mesh.corners(x.detach().double().cpu().numpy())
             error = error + torch.from_numpy((weights * self.unseen[nodes]).sum(0)).to(error)
@@ -221,13 +226,15 @@ class GridSolution:
 
     @property
     def largest_error(self) -> float:
-        """The largest `error` at tau = horizon over the nodes within `problem.states` and outside A and B.
+        """The largest estimate of the error at tau = horizon and the nodes within `problem.states`, outside A and B.
 
-        It is taken at the horizon, since V jumps at tau = 0 on the faces, where no mesh has a small error.
+        The neighbourhood of a node ends at nodes, so that it is left out. The estimate is taken at the horizon,
+        since V jumps at tau = 0 on the faces, where no mesh has a small error.
         """
         x = torch.from_numpy(self.mesh.states(self.mesh.indices()))
         x = x[self.problem.states.contains(x) & self.problem.interior(x)]
-        return float(self.error(torch.full((len(x),), self.problem.horizon, dtype=x.dtype), x).max())
+        tau = torch.full((len(x),), self.problem.horizon, dtype=x.dtype)
+        return float(self._error(tau, x, Estimate.at).max())
 
     def _between(self, tau: Tensor, x: Tensor) -> Tensor:
         """V (P,) between the nodes, extrapolated where no face is near, and continued into A and B."""
