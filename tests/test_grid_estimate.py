@@ -81,9 +81,10 @@ def test_the_estimate_sees_what_upwind_jumps_smear_where_the_noise_is_weak_in_a_
     assert (x[wrong, 1] < 0.2).all()
     assert (estimate[wrong] > DOUBT).all()
     assert (parts(solution).distance(tau, x)[wrong] <= DOUBT).double().mean() > 0.05, "the distance of both would do"
-    # Where the noise is stronger than that of the jumps, it is the distance alone.
+    # Where the noise is stronger than that of the jumps, that at single states is the distance alone.
     strong = x[:, 1] > 0.3
     assert (parts(solution).at(tau, x)[strong] < DOUBT).double().mean() > 0.9
+    assert (estimate[strong] < DOUBT).double().mean() > 0.85
 
 
 @pytest.mark.parametrize("count", [41, 61])
@@ -103,4 +104,3 @@ def test_the_estimate_of_smooth_values_is_that_of_single_states():
     tau, x = late_states(problem, 1_000)
     solution = GridSolver(problem, points=41).solve()
     assert solution.error(tau, x).mean() < 1.5 * parts(solution).at(tau, x).mean()
-    assert (solution.error(tau, x) >= parts(solution).at(tau, x)).all()

@@ -27,7 +27,7 @@ class Tightrope(ReachAvoidProblem):
 
 
 class Casino(ReachAvoidProblem):
-    """Double a stake before it is lost, in an unfair game: each bet costs a share of it, and no bet costs nothing."""
+    """Win a sum before ruin in an unfair game: a bet u costs 0.2 |u| on average, and no bet costs nothing."""
 
     horizon = 4.0
     states, controls = Box([0.0], [2.0]), Box([-0.8], [0.8])
@@ -81,7 +81,7 @@ class Uphill(ReachAvoidProblem):
 
 
 class Gene(ReachAvoidProblem):
-    """Breed for a gene until 95 % of a herd have it, or until 5 % have it; by the law of Wright and Fisher."""
+    """Breed for a gene until 95 % of a herd carry it, before it is down to 5 %; by the law of Wright and Fisher."""
 
     horizon = 5.0
     states, controls = Box([0.0], [1.0]), Box([-0.5], [0.5])
