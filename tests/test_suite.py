@@ -47,7 +47,7 @@ def test_every_problem_of_the_suite_has_states_and_a_source():
 
 
 def test_the_grid_is_the_truth_where_no_closed_form_is_known(monkeypatch):
-    monkeypatch.setattr("pirl_rl.scoring.truth.GRID_POINTS", {2: 31})
+    monkeypatch.setattr("pirl_rl.scoring.truth.GRID_POINTS", {2: 61})
     truth = find_truth(Pendulum(), 100, 0)
     assert truth.source == "grid"
     assert 0 < truth.error < 0.1
