@@ -34,15 +34,16 @@ def descended(constraints: Callable[[Tensor], Tensor], x: Tensor, box: Box, step
         steps: their number; the fewer, the longer is each, so that all together lead as far.
     """
 
-    def level(z: Tensor) -> Tensor:
-        return constraints(box.wrap(box.denormalize(z))).amax(-1)
-
     z = box.normalize(x).clone().requires_grad_()
-    slope, optimizer = torch.func.grad(lambda z: level(z).sum()), torch.optim.Adam([z], lr=FIRST * STEPS / steps)
+    optimizer = torch.optim.Adam([z], lr=FIRST * STEPS / steps)
     decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (LAST / FIRST) ** (1 / steps))
     for _ in range(steps):
+        with torch.enable_grad():
+            # The second term gives a level that is constant everywhere its slope of 0.
+            level = constraints(box.wrap(box.denormalize(z))).amax(-1).sum() + 0 * z.sum()
+            (slope,) = torch.autograd.grad(level, z)
         # Where the level has no slope, as where it is infinite, the last steps lead on.
-        z.grad = slope(z.detach()).nan_to_num(0.0, 0.0, 0.0)
+        z.grad = slope.nan_to_num(0.0, 0.0, 0.0)
         optimizer.step()
         decay.step()
         with torch.no_grad():

@@ -70,11 +70,12 @@ def across_sets(problem: ReachAvoidProblem, x: Tensor, u: Tensor) -> list[Move]:
     """
     moves = []
     if problem.objective == "reach-avoid":
-        moves += _across(problem, "the target", problem.scaled_reached_constraints, x, u)
+        levels = problem.scaled_reached_constraints
+        moves += _across(problem, "the target", levels, torch.ones_like(levels(x[:1]), dtype=torch.bool), x, u)
     if problem.has_avoid_set:
         # B is a union: each of its constraints is a set of its own.
-        for index in range(problem.avoid_constraints(x[:1]).shape[-1]):
-            moves += _across(problem, "the avoid set", _part(problem.scaled_avoid_constraints, index), x, u)
+        levels = problem.scaled_avoid_constraints
+        moves += _across(problem, "the avoid set", levels, torch.eye(levels(x[:1]).shape[-1], dtype=torch.bool), x, u)
     return moves
 
 
@@ -112,21 +113,48 @@ def control_rate(problem: ReachAvoidProblem, x: Tensor, u: Tensor) -> float:
     return (reach * noise).amax(-1).nanmedian().item()
 
 
-def _part(constraints: Callable[[Tensor], Tensor], index: int) -> Callable[[Tensor], Tensor]:
-    return lambda x: constraints(x)[..., index : index + 1]
-
-
 def _across(
-    problem: ReachAvoidProblem, name: str, constraints: Callable[[Tensor], Tensor], x: Tensor, u: Tensor
+    problem: ReachAvoidProblem, name: str, levels: Callable[[Tensor], Tensor], own: Tensor, x: Tensor, u: Tensor
 ) -> list[Move]:
-    """The rates across each constraint of the set in which all of them hold, at points inside it."""
+    """The rates across each constraint of each part of a set, at points inside the part.
+
+    Args:
+        problem: the physics.
+        name: of the set.
+        levels: the k constraints (N, k) of all parts at states (N, n).
+        own: which of them each part has (parts, k), bool; all of these hold in the part.
+        x: states (N, n).
+        u: physical controls (N, m).
+    """
+    here = levels(x)
+    lowest = [x[here[:, part].amax(-1).argsort()[:STARTS]] for part in own]
+    others = ~own.repeat_interleave(len(lowest[0]), 0)
+    # All parts descend at once, since a union may have many.
+    deep = descended(lambda x: levels(x).masked_fill(others, -torch.inf), torch.cat(lowest), problem.states)
+    moves = []
+    for part, starts, ends in zip(own, lowest, deep.split(len(lowest[0])), strict=True):
+        moves += _across_part(problem, name, lambda x, part=part: levels(x)[..., part], x, u, starts, ends)
+    return moves
+
+
+def _across_part(
+    problem: ReachAvoidProblem,
+    name: str,
+    constraints: Callable[[Tensor], Tensor],
+    x: Tensor,
+    u: Tensor,
+    lowest: Tensor,
+    deep: Tensor,
+) -> list[Move]:
+    """The rates across each constraint of a set, from the states (K, n) of lowest level and the ends of their descent.
+
+    Where the physics has no number inside the set, they are those of states beside it.
+    """
 
     def holds(x: Tensor) -> Tensor:
         return (constraints(x) <= 0).all(-1)
 
-    nearest_first = x[constraints(x).amax(-1).argsort()]
-    lowest, beside = nearest_first[:STARTS], nearest_first[~holds(nearest_first)][:STARTS]
-    deep = descended(constraints, lowest, problem.states)
+    beside = lowest[~holds(lowest)]
     found = torch.cat([x, deep])
     found = found[holds(found)]
     if not len(found):

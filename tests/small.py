@@ -8,6 +8,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from copy import deepcopy
+from functools import cache
 from pathlib import Path
 
 import torch
@@ -39,8 +41,11 @@ TUNED += ("collector.warmup_frames=64", "figures=false")
 DRIFT = ("+experiment=drift", "+debug=drift", "evaluation.during=[]", "evaluation.final=[]")
 
 
+composed = cache(compose)  # Hydra takes a good part of the time of a run of a few updates
+
+
 def small_config(*overrides: str, base: Sequence[str] = QUICK):
-    return compose("train", [*base, *overrides])
+    return deepcopy(composed("train", (*base, *overrides)))
 
 
 def small_trainer(folder: Path, *overrides: str, base: Sequence[str] = (*QUICK, *EVENTS)) -> Trainer:

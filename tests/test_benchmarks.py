@@ -71,7 +71,7 @@ def test_every_benchmark_is_a_file():
     assert all((command.FOLDER / file).is_file() for file in files)
 
 
-@pytest.mark.parametrize("experiment", ["reach1d", "drift"])
+@pytest.mark.parametrize("experiment", ["reach1d", pytest.param("drift", marks=pytest.mark.slow)])
 def test_peers_compares_networks_of_the_widths_that_it_names(experiment):
     pytest.importorskip("stable_baselines3", reason="needs the extra baselines")
     from benchmarks import peers
@@ -180,7 +180,7 @@ def test_the_table_has_both_clocks_and_leaves_out_what_is_not_reached():
 
 
 def test_a_mixture_succeeds_with_the_product_of_the_probabilities_of_its_parts():
-    problem, rollouts = PROBLEMS["Bearing"](), 400
+    problem, rollouts = PROBLEMS["Bearing"](), 150
     x = sample_interior(problem, problem.states, 25, torch.Generator().manual_seed(0), torch.float64)
     tau = torch.full((25,), problem.horizon / 3, dtype=torch.float64)
     clock = {"rollouts": rollouts, "dt": problem.horizon / 200}

@@ -230,11 +230,11 @@ def test_a_larger_target_never_lowers_the_value():
 
 def test_degenerate_noise_agrees_with_monte_carlo_of_its_own_policy():
     problem = DoubleIntegrator(position_noise=0.0)
-    solution = GridSolver(problem, points=101).solve()
+    solution = GridSolver(problem, points=81).solve()
     tau, x = (values[:100] for values in late_states(problem))
-    played = monte_carlo(problem, solution.policy, tau, x, rollouts=200, dt=0.01)
+    played = monte_carlo(problem, solution.policy, tau, x, rollouts=100, dt=0.02)
     # Without noise on the position the scheme is of first order, and its error is that of the estimate. The standard
-    # error of one probability is 0.035 at most; that of the mean over 100 states is a tenth of it.
+    # error of one probability is 0.05 at most; that of the mean over 100 states is a tenth of it.
     distance = solution.value(tau, x) - played.probability
     assert abs(distance.mean().item()) < solution.error(tau, x).mean() + 0.01
     assert distance.abs().mean() < solution.error(tau, x).mean() + 0.03
@@ -380,16 +380,22 @@ class Calm(HalfSpace):
 
 
 def test_weak_noise_in_three_dimensions_has_its_closed_form():
-    """The layer in which V rises from 0 to 1 is as wide as one cell of the coarser mesh."""
-    problem, errors = Calm(), []
+    """The layer in which V rises from 0 to 1 is as wide as one cell of the coarser mesh, and a vertex is the best
+    control. Extrapolation from half the points leaves six tenths of the error at most."""
+    problem = Calm()
     tau, x = late_states(problem, 1_000)
-    for count in (17, 25):
-        solution = GridSolver(problem, points=count, levels=2, estimate=False).solve()  # a vertex is the best control
-        assert solution.split
-        error = (solution.value(tau, x) - problem.exact_value(tau, x)).abs()
-        errors.append(error.mean().item())
-    assert errors[0] < 0.018
-    assert errors[1] < 0.010
+    exact = problem.exact_value(tau, x)
+    coarser = GridSolver(problem, points=17, levels=2, estimate=False).solve()
+    finer = GridSolver(problem, points=25, levels=2).solve()
+    assert coarser.split
+    assert finer.split
+    extrapolated, estimate = (finer.value(tau, x) - exact).abs(), finer.error(tau, x)
+    finer.coarse = None
+    plain = (finer.value(tau, x) - exact).abs()
+    assert (coarser.value(tau, x) - exact).abs().mean() < 0.018
+    assert plain.mean() < 0.010
+    assert extrapolated.mean() < 0.6 * plain.mean()
+    assert (extrapolated <= estimate + 0.03).all()
 
 
 class Adrift(ReachAvoidProblem):
@@ -651,16 +657,6 @@ def test_a_target_is_resolved_by_four_nodes_in_a_row(problem, count, resolved):
     assert GridSolver(problem, points=count).resolves_target is resolved
 
 
-def test_extrapolation_lowers_the_error_of_turns():
-    problem = Calm()
-    tau, x = late_states(problem, 1_000)
-    solution, exact = GridSolver(problem, points=25, levels=2).solve(), problem.exact_value(tau, x)
-    error, estimate = (solution.value(tau, x) - exact).abs(), solution.error(tau, x)
-    assert (error <= estimate + 0.03).all()
-    solution.coarse = None
-    assert error.mean() < 0.6 * (solution.value(tau, x) - exact).abs().mean()
-
-
 class Hasty(Landfall):
     """A `Landfall` whose height has so much noise that only the largest speed is large beside the noise."""
 
@@ -685,7 +681,9 @@ def test_drift_and_noise_act_in_turns_where_the_noise_is_weak(problem, split):
     assert not GridSolver(problem, points=11, estimate=False, turns=False).solve().split
 
 
-@pytest.mark.parametrize(("count", "mean", "largest"), [(61, 0.004, 0.03), (121, 0.001, 0.01)])
+@pytest.mark.parametrize(
+    ("count", "mean", "largest"), [(61, 0.004, 0.03), pytest.param(121, 0.001, 0.01, marks=pytest.mark.slow)]
+)
 def test_noise_that_depends_on_the_control_acts_in_turns_with_the_drift(count, mean, largest):
     """V jumps where the way is tau. If both act together it is smeared, and with 61 nodes wrong by up to 0.34 at these
     states. The policy is judged where V is below 1, since elsewhere slower controls are as good."""
@@ -707,10 +705,10 @@ def dubins() -> GridSolution:
 
 
 def test_the_dubins_car_agrees_with_monte_carlo_of_its_own_policy(dubins):
-    """With 400 paths from each of 100 states a perfect V would have about 0.008."""
+    """With 100 paths from each of 100 states a perfect V would have about 0.016."""
     problem, solution = dubins.problem, dubins
     tau, x = (values[:100] for values in late_states(problem))
-    played = monte_carlo(problem, solution.policy, tau, x, rollouts=400, dt=0.02)
+    played = monte_carlo(problem, solution.policy, tau, x, rollouts=100, dt=0.02)
     assert (solution.value(tau, x) - played.probability).abs().mean() < 0.035
 
 
@@ -721,7 +719,7 @@ def test_v_rises_from_a_wall_that_paths_leave(dubins):
     away = torch.stack([distance - problem.wall, 0 * distance, 0 * distance], -1)
     tau = torch.full((4,), 4.0, dtype=torch.float64)
     value = solution.value(tau, away)
-    played = monte_carlo(problem, solution.policy, tau, away, rollouts=2_000, dt=0.01)
+    played = monte_carlo(problem, solution.policy, tau, away, rollouts=500, dt=0.01)
     assert (value - played.probability).abs().max() < 0.1
     layer = 1 - (-2 * problem.speed * distance / problem.noise[0] ** 2).exp()
     assert (value / value[-1] - layer)[:2].abs().max() < 0.01
@@ -730,7 +728,7 @@ def test_v_rises_from_a_wall_that_paths_leave(dubins):
 def test_noise_saves_paths_that_the_flow_leads_into_a_wall(dubins):
     """A car that meets a wall at a small angle may be pushed off it: without noise V would be 0.
 
-    With 1,000 paths from each of 20 states a perfect V would have a mean error of about 0.01.
+    With 500 paths from each of 20 states a perfect V would have a mean error of about 0.014.
     """
     problem, solution = dubins.problem, dubins
     distance = torch.linspace(0.02, 0.08, 20, dtype=torch.float64)
@@ -738,7 +736,7 @@ def test_noise_saves_paths_that_the_flow_leads_into_a_wall(dubins):
     x = torch.stack([problem.wall - distance, torch.full_like(angle, -1.2), math.pi / 2 - angle], -1)
     tau = torch.full((20,), 2.5, dtype=torch.float64)
     value = solution.value(tau, x)
-    played = monte_carlo(problem, solution.policy, tau, x, rollouts=1_000, dt=0.005).probability
+    played = monte_carlo(problem, solution.policy, tau, x, rollouts=500, dt=0.005).probability
     assert (value - played).abs().mean() < 0.03
 
 

@@ -87,7 +87,7 @@ def test_the_estimate_sees_what_upwind_jumps_smear_where_the_noise_is_weak_in_a_
     assert (estimate[strong] < DOUBT).double().mean() > 0.85
 
 
-@pytest.mark.parametrize("count", [41, 61])
+@pytest.mark.parametrize("count", [41, pytest.param(61, marks=pytest.mark.slow)])
 def test_the_estimate_sees_the_middle_of_a_jump_between_nodes(count):
     """V jumps where the way is tau, and no noise acts along the way. In the middle of the jump both meshes have about
     the mean of its sides there, and no curvature, so that the estimate of single states is small."""

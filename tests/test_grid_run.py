@@ -74,7 +74,7 @@ def test_a_solution_survives_its_file(problem, tmp_path):
     solution.save(tmp_path / "grid.npz")
     loaded = GridSolution.load(tmp_path / "grid.npz", problem)
     rng = torch.Generator().manual_seed(0)
-    x, tau = problem.states.sample(200, rng, torch.float64), problem.horizon * torch.rand(200, generator=rng)
+    x, tau = problem.states.sample(50, rng, torch.float64), problem.horizon * torch.rand(50, generator=rng)
     for name in ("value", "policy", "error", "gradient"):
         assert torch.equal(getattr(loaded, name)(tau, x), getattr(solution, name)(tau, x)), name
 

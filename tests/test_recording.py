@@ -98,16 +98,19 @@ def assert_replays_do_what_the_work_does(monkeypatch, folder, updates: int, memb
     torch.testing.assert_close(*found, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("members", [1, 3])
+@pytest.mark.parametrize("members", [1, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("base", BASES.values(), ids=BASES)
 def test_replays_do_what_the_work_does(as_on_a_gpu, monkeypatch, base, members, tmp_path):
     assert_replays_do_what_the_work_does(monkeypatch, tmp_path, 12, members, base)
 
 
 SHIPPED = ("dubins", "zermelo", "pendulum", "cartpole", "quadrotor", "halfspace", "radial_exit", "drift3")
+RECORDED_BY_DEFAULT = ("zermelo", "drift3")
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in RECORDED_BY_DEFAULT)) for name in SHIPPED]
+)
 def test_the_shipped_problems_can_be_recorded(as_on_a_gpu, monkeypatch, name, tmp_path):
     """With all terms of the loss, so that drift, diffusion and levels are computed."""
     small = ("env.num_envs=16", "collector.frames_per_batch=32", "collector.warmup_frames=32")

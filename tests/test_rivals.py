@@ -46,9 +46,18 @@ def test_a_car_that_cannot_stop_has_no_regulator():
         linear_quadratic(DubinsCar(), Simulator(DubinsCar(), 0.1), 0.0, 0)
 
 
-@pytest.mark.parametrize(("name", "calls"), [pytest.param("ppo", 2_560, marks=pytest.mark.slow), ("sac", 400)])
-def test_learners_of_the_library_learn_to_reach(name, calls, monkeypatch):
-    """Their policy comes nearer to the optimum of the one-dimensional benchmark than to its reverse.
+@pytest.mark.parametrize(
+    ("name", "calls", "learns"),
+    [
+        ("ppo", 20, False),
+        ("sac", 20, False),
+        pytest.param("ppo", 2_560, True, marks=pytest.mark.slow),
+        pytest.param("sac", 400, True, marks=pytest.mark.slow),
+    ],
+)
+def test_learners_of_the_library_learn_to_reach(name, calls, learns, monkeypatch):
+    """Their policy comes nearer to the optimum of the one-dimensional benchmark than to its reverse, where it learns
+    for long enough.
 
     A number of steps of all paths takes the place of the time that ends a training, which differs between machines.
     """
@@ -68,7 +77,7 @@ def test_learners_of_the_library_learn_to_reach(name, calls, monkeypatch):
         return mean_payoff(simulator, policy, tau, x, 40, torch.Generator().manual_seed(0)).mean()
 
     best, worst = success(problem.optimal_control), success(lambda tau, x: -problem.optimal_control(tau, x))
-    assert success(learned) > (best + worst) / 2
+    assert not learns or success(learned) > (best + worst) / 2
 
 
 def test_names_of_rivals():

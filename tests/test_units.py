@@ -82,7 +82,7 @@ def test_levels_in_an_extreme_unit_give_the_same_exits_faces_and_weights(unit):
     assert count == other_count == 8_192
 
 
-@pytest.mark.parametrize("method", ["pirl", "pinn"])
+@pytest.mark.parametrize("method", ["pirl", pytest.param("pinn", marks=pytest.mark.slow)])
 def test_a_problem_in_other_units_is_learned_alike(method, tmp_path):
     """Two batches are collected and twelve updates made; only rounding may differ, in single precision."""
     runs = [

@@ -87,12 +87,12 @@ def places(samples: Samples) -> Iterator[Finding]:
     # The descent stays in a box twice as wide as the one that it is given.
     rng, narrow = torch.Generator().manual_seed(0), problem.states.expand(0.505)
     for what, part, inside in _sets(samples):
-        level = _level(problem, what)
-        lowest = descended(lambda x, level=level: level(x).unsqueeze(-1), narrow.sample(STARTS, rng), narrow)
-        absorbs = problem.reached if what == "target" else problem.failed
         own = faces.points[faces.values.round() == (what == "target")]
-        seen = (inside.any(), absorbs(lowest).any(), problem.states.expand(1.01).contains(own).any())
-        if not any(seen):
+        if inside.any() or problem.states.expand(1.01).contains(own).any():
+            continue
+        level, absorbs = _level(problem, what), problem.reached if what == "target" else problem.failed
+        lowest = descended(lambda x, level=level: level(x).unsqueeze(-1), narrow.sample(STARTS, rng), narrow)
+        if not absorbs(lowest).any():
             message = (
                 f"the {what} lies outside the box of states, in which paths start and V is learned; widen the box "
                 "until it touches the set."

@@ -63,13 +63,11 @@ def find_faces(problem: ReachAvoidProblem, rng: torch.Generator) -> Faces:
     if len(interior) < DESCENTS:
         interior = torch.cat([interior, sample_interior(problem, problem.states, DESCENTS, rng, torch.float64)])
     found = []
-    for name, absorbs, value, levels, columns in _sets(problem):
+    for name, absorbs, value, levels, own in _sets(problem):
         # All parts are asked at once, since a union may have many.
         holds, absorbed = levels(candidates) <= 0, absorbs(candidates)
-        sampled = [candidates[holds[:, part].all(-1) & absorbed] for part in columns]
-        descents = min(DESCENTS, max(1, MOST_PARTS * DESCENTS // len(columns)))
-        pairs = zip(columns, sampled, strict=True)
-        parts = [ways for pair in pairs if (ways := _inside(absorbs, levels, *pair, descents, problem, rng))]
+        sampled = [candidates[holds[:, part].all(-1) & absorbed] for part in own]
+        parts = [ways for ways in _inside(absorbs, levels, own, sampled, problem, rng) if ways]
         if not parts:
             raise ProblemError(
                 f"{type(problem).__name__}: no point of the {name} was found, neither among {len(candidates)} points "
@@ -146,40 +144,47 @@ class NearFaces:
 Levels = Callable[[Tensor], Tensor]
 
 
-def _sets(problem: ReachAvoidProblem) -> list[tuple[str, Levels, float, Levels, list[slice]]]:
-    """A and B, as far as they absorb: name, membership, V, the levels, and which of them each part of a union has."""
-    sets: list[tuple[str, Levels, float, Levels, list[slice]]] = []
+def _sets(problem: ReachAvoidProblem) -> list[tuple[str, Levels, float, Levels, Tensor]]:
+    """A and B, as far as they absorb: name, membership, V, the k levels, and which of them each part has (parts, k)."""
+    sets: list[tuple[str, Levels, float, Levels, Tensor]] = []
+    one = problem.states.sample(1, torch.Generator().manual_seed(0))
     if problem.objective == "reach-avoid":
-        sets.append(("target", problem.reached, 1.0, problem.scaled_reached_constraints, [slice(None)]))
+        levels = problem.scaled_reached_constraints
+        sets.append(("target", problem.reached, 1.0, levels, torch.ones_like(levels(one), dtype=torch.bool)))
     if problem.has_avoid_set:
-        count = problem.avoid_constraints(problem.states.sample(1, torch.Generator().manual_seed(0))).shape[-1]
-        columns = [slice(index, index + 1) for index in range(count)]
-        sets.append(("avoid set", problem.failed, 0.0, problem.scaled_avoid_constraints, columns))
+        levels = problem.scaled_avoid_constraints
+        sets.append(("avoid set", problem.failed, 0.0, levels, torch.eye(levels(one).shape[-1], dtype=torch.bool)))
     return sets
 
 
 def _inside(
     absorbs: Levels,
     levels: Levels,
-    part: slice,
-    sampled: Tensor,
-    count: int,
+    own: Tensor,
+    sampled: list[Tensor],
     problem: ReachAvoidProblem,
     rng: torch.Generator,
-) -> list[Tensor]:
-    """Points (K, n) of a part of a set: those that were sampled, and others that so many descents find, as far as there
-    are any.
+) -> list[list[Tensor]]:
+    """Points (K, n) of each part of a set: those that were sampled, and others that descents find, as far as there are
+    any.
 
     A few sampled points are joined to the others, since they would be drawn again and again.
     """
+    count = min(DESCENTS, max(1, MOST_PARTS * DESCENTS // len(own)))
+    others = ~own.repeat_interleave(count, 0)
+    few = [len(points) < DESCENTS for points in sampled]
 
     def of_part(x: Tensor) -> Tensor:
-        return levels(x)[..., part]
+        return levels(x).masked_fill(others, -torch.inf)
 
-    starts, few = problem.states.sample(count, rng, sampled.dtype), len(sampled) < DESCENTS
-    deep = descended(of_part, starts, problem.states, STEPS if few else FEWER_STEPS)
-    deep = deep[(of_part(deep) <= 0).all(-1) & absorbs(deep)]
-    return [inside for inside in ([torch.cat([sampled, deep])] if few else [sampled, deep]) if len(inside)]
+    starts = problem.states.sample(len(others), rng, torch.float64)
+    deep = descended(of_part, starts, problem.states, STEPS if any(few) else FEWER_STEPS)
+    holds = (of_part(deep) <= 0).all(-1) & absorbs(deep)
+    parts = []
+    for points, ends, held, joined in zip(sampled, deep.split(count), holds.split(count), few, strict=True):
+        ways = [torch.cat([points, ends[held]])] if joined else [points, ends[held]]
+        parts.append([inside for inside in ways if len(inside)])
+    return parts
 
 
 def _drawn(points: Tensor, count: int, rng: torch.Generator) -> Tensor:
