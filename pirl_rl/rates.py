@@ -154,7 +154,6 @@ def _across_part(
     def holds(x: Tensor) -> Tensor:
         return (constraints(x) <= 0).all(-1)
 
-    beside = lowest[~holds(lowest)]
     found = torch.cat([x, deep])
     found = found[holds(found)]
     if not len(found):
@@ -163,7 +162,9 @@ def _across_part(
     entering = holds(deep) & ~holds(lowest)
     face = bisected(holds, deep[entering], lowest[entering])
     rates = _speeds(problem, constraints, torch.cat([x[holds(x)], (face + deep[entering]) / 2]), u)
-    if rates.isnan().any() and len(beside):
+    outside = x[~holds(x)]
+    if rates.isnan().any() and len(outside):
+        beside = outside[constraints(outside).amax(-1).argsort()[:STARTS]]
         rates = torch.where(rates.isnan(), _speeds(problem, constraints, beside, u), rates)
     pairs = zip(depths, *rates.tolist(), strict=True)
     return [Move(name, v / depth, s / depth) for depth, v, s in pairs if depth > 0]

@@ -247,6 +247,7 @@ def test_workers_feed_resume_die_and_leave_nothing(tmp_path):
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_with_the_buffer_s_lock_is_noticed(tmp_path):
     trainer = small_trainer(tmp_path, *ASYNC, "trainer.updates=1000000")
     collector = trainer.collector

@@ -16,6 +16,9 @@ from pirl_rl.curriculum import Curriculum, Stage
 from pirl_rl.errors import ConfigError
 
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
+WITH_SETTINGS = {"own", "reach1d", "reach1d_paper", *(name for name in EXPERIMENTS if name.startswith("drift"))}
+"""The experiments with settings of their own, and one with a problem and one without; the others choose a problem."""
+
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml") if path.stem != "grid")
 """The methods that learn."""
 
@@ -41,7 +44,9 @@ def composed(experiment: str, *overrides: str):
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
+@pytest.mark.parametrize(
+    "experiment", [pytest.param(name, marks=[pytest.mark.slow] * (name not in WITH_SETTINGS)) for name in EXPERIMENTS]
+)
 def test_every_pair_is_what_the_method_says_or_refused(experiment, method):
     if (experiment, method) in REFUSED:
         with pytest.raises(ConfigError, match=f"{experiment} is made for method=pirl, got {method}"):

@@ -270,7 +270,8 @@ def test_bad_populations_leave_nothing(settings, message, tmp_path, in_process):
 
 
 def test_python_trains_a_population(tmp_path):
-    runs = pirl_rl.train("reach1d", seeds=[0, 1], folder=tmp_path / "out", debug="default", report=False, figures=False)
+    settings = {"debug": "default", "report": False, "figures": False, "evaluation.final": ["exact"]}
+    runs = pirl_rl.train("reach1d", seeds=[0, 1], folder=tmp_path / "out", **settings)
     assert [run.config.seed for run in runs] == [0, 1]
     assert runs[0].update > 0
 

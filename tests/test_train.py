@@ -59,7 +59,7 @@ def only_run(folder: Path) -> Path:
 
 
 # The other experiments differ from one of these in their physics or their stages alone.
-TRAINED_BY_DEFAULT = ("drift", "drift_refine", "own", "reach1d_paper", "safety1d")
+TRAINED_BY_DEFAULT = ("drift", "own", "reach1d_paper", "safety1d")
 EXPERIMENTS = [
     pytest.param(name, marks=[pytest.mark.slow] * (name not in TRAINED_BY_DEFAULT)) for name in names("experiment")
 ]
