@@ -15,6 +15,9 @@ STEPS = 400
 FEWER_STEPS = 100
 """The number of steps that suffice where a set is not thin, and its parts are looked for."""
 
+MOST_PARTS = 16
+"""The number of parts of a union from which each of them has fewer descents, so that all together have no more."""
+
 FIRST, LAST = 0.05, 1e-6
 """Sizes of the first and the last of `STEPS` steps, in coordinates in which the box is [-1, 1]^n."""
 
@@ -49,6 +52,12 @@ def descended(constraints: Callable[[Tensor], Tensor], x: Tensor, box: Box, step
         with torch.no_grad():
             z.clamp_(-2, 2)
     return box.wrap(box.denormalize(z.detach()))
+
+
+def starts_of_a_part(wanted: int, parts: int) -> int:
+    """The number of descents of each part of a set: the wanted one, or fewer where the set has more parts than
+    `MOST_PARTS`."""
+    return min(wanted, max(1, MOST_PARTS * wanted // parts))
 
 
 def bisected(absorbs: Callable[[Tensor], Tensor], inside: Tensor, outside: Tensor) -> Tensor:

@@ -16,11 +16,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pirl_rl.descent import bisected, descended
+from pirl_rl.descent import bisected, descended, starts_of_a_part
 from pirl_rl.problem import ReachAvoidProblem
 
 STARTS = 64
-"""The number of states of lowest level from which the descent to deep points of a set starts."""
+"""The number of states of lowest level from which the descent to deep points of a part of a set starts."""
 
 DIFFERENCE = 1e-6
 """Half the step of the differences in the drift's Jacobian, in half widths of the box."""
@@ -126,8 +126,8 @@ def _across(
         x: states (N, n).
         u: physical controls (N, m).
     """
-    here = levels(x)
-    lowest = [x[here[:, part].amax(-1).argsort()[:STARTS]] for part in own]
+    here, count = levels(x), starts_of_a_part(STARTS, len(own))
+    lowest = [x[here[:, part].amax(-1).argsort()[:count]] for part in own]
     others = ~own.repeat_interleave(len(lowest[0]), 0)
     # All parts descend at once, since a union may have many.
     deep = descended(lambda x: levels(x).masked_fill(others, -torch.inf), torch.cat(lowest), problem.states)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pirl_rl.descent import FEWER_STEPS, STEPS, bisected, descended
+from pirl_rl.descent import FEWER_STEPS, STEPS, bisected, descended, starts_of_a_part
 from pirl_rl.errors import ArgumentError, ProblemError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.initial_states import InitialStates, mixed, sample_interior
@@ -24,9 +24,6 @@ FACE_POOL = 16_384
 
 DESCENTS = 256
 """The number of states from which the levels of each part of a set are descended."""
-
-MOST_PARTS = 16
-"""The number of parts of a union from which each of them has fewer descents, so that all together have no more."""
 
 
 class Faces(NamedTuple):
@@ -170,7 +167,7 @@ def _inside(
 
     A few sampled points are joined to the others, since they would be drawn again and again.
     """
-    count = min(DESCENTS, max(1, MOST_PARTS * DESCENTS // len(own)))
+    count = starts_of_a_part(DESCENTS, len(own))
     others = ~own.repeat_interleave(count, 0)
     few = [len(points) < DESCENTS for points in sampled]
 
