@@ -50,16 +50,28 @@ class Field:
         Raises:
             ArgumentError: a tau is outside [0, horizon].
         """
-        horizon, last = self.problem.horizon, len(self.values) - 1
-        if not bool(((tau >= 0) & (tau <= horizon * (1 + ROUNDING))).all()):
-            raise ArgumentError(f"tau: expected 0 <= tau <= horizon = {horizon}, got {tau.min()} to {tau.max()}")
-        level = last * np.sqrt((tau.double().cpu().numpy() / horizon).clip(0, 1))
-        before = np.floor(level).astype(int).clip(0, last - 1)
+        level = self._level(tau)
+        before = np.floor(level).astype(int).clip(0, len(self.values) - 2)
         share = level - before
         nodes, weights = self.mesh.corners(x.detach().double().cpu().numpy())
         for node, weight in zip(nodes, weights, strict=True):
             yield before, node, weight * (1 - share)
             yield before + 1, node, weight * share
+
+    def nearest(self, tau: Tensor, x: Tensor) -> tuple[np.ndarray, np.ndarray]:
+        """Time level and node, each (P,), of the point that has the largest weight in the interpolation.
+
+        Raises:
+            ArgumentError: a tau is outside [0, horizon].
+        """
+        return np.ceil(self._level(tau) - 0.5).astype(int), self.mesh.nearest(x.detach().double().cpu().numpy())
+
+    def _level(self, tau: Tensor) -> np.ndarray:
+        """The place of tau among the time levels, (P,)."""
+        horizon, last = self.problem.horizon, len(self.values) - 1
+        if not bool(((tau >= 0) & (tau <= horizon * (1 + ROUNDING))).all()):
+            raise ArgumentError(f"tau: expected 0 <= tau <= horizon = {horizon}, got {tau.min()} to {tau.max()}")
+        return last * np.sqrt((tau.double().cpu().numpy() / horizon).clip(0, 1))
 
     def uncut(self, x: Tensor) -> Tensor:
         """Whether all corners of the cells around the states lie outside A and B, (P,) bool."""

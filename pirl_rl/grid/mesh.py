@@ -87,14 +87,23 @@ class Mesh:
 
     def corners(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Multilinear interpolation at states (P, n): numbers (2^n, P) of nodes and their weights (2^n, P)."""
-        position = (x - self.low) / self.spacing
-        for axis in set(range(len(self.shape))) - set(self.periodic):
-            position[:, axis] = position[:, axis].clip(0, self.shape[axis] - 1)
+        position = self._position(x)
         base = np.floor(position)
         share = position - base
         offsets = np.indices((2,) * len(self.shape)).reshape(len(self.shape), -1).T[:, None]
         weights = np.where(offsets == 1, share, 1 - share).prod(-1)
         return self.flat(base.astype(int) + offsets), weights
+
+    def nearest(self, x: np.ndarray) -> np.ndarray:
+        """The number (P,) of the node that has the largest weight in the interpolation at states (P, n)."""
+        return self.flat(np.ceil(self._position(x) - 0.5).astype(int))
+
+    def _position(self, x: np.ndarray) -> np.ndarray:
+        """The coordinates of states (P, n) in distances of two nodes from the first one, within the mesh."""
+        position = (x - self.low) / self.spacing
+        for axis in set(range(len(self.shape))) - set(self.periodic):
+            position[:, axis] = position[:, axis].clip(0, self.shape[axis] - 1)
+        return position
 
 
 def absorbed(problem: ReachAvoidProblem, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -190,12 +190,7 @@ class GridSolution:
         Raises:
             ArgumentError: a tau is outside [0, horizon].
         """
-        largest, level, node = np.full(len(x), -1.0), np.zeros(len(x), int), np.zeros(len(x), int)
-        for time, corner, weight in self.field.corners(tau, x):
-            heavier = weight > largest
-            largest, level, node = (
-                np.where(heavier, new, old) for new, old in ((weight, largest), (time, level), (corner, node))
-            )
+        level, node = self.field.nearest(tau, x)
         place = self._nearest[node]
         return torch.from_numpy(self._controls[self._policy[level, place], place]).to(x)
 
