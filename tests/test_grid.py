@@ -277,6 +277,20 @@ class Calming(ReachAvoidProblem):
         return (wave * torch.exp(-((k * math.pi / 4) ** 2) * tau.unsqueeze(-1) / 2)).sum(-1)
 
 
+def test_the_control_is_that_of_the_point_with_the_largest_weight():
+    """Some of the states lie beyond the mesh, and across the seam of the circle."""
+    problem = DubinsCar()
+    solution = GridSolver(problem, points=11, estimate=False).solve()
+    rng = torch.Generator().manual_seed(0)
+    x = problem.states.expand(1.5).sample(2_000, rng, torch.float64)
+    tau = problem.horizon * torch.rand(len(x), generator=rng, dtype=x.dtype)
+    corners = [np.stack(entries) for entries in zip(*solution.field.corners(tau, x), strict=True)]
+    largest = corners[2].argmax(0)[None]
+    expected = [np.take_along_axis(entry, largest, 0)[0] for entry in corners[:2]]
+    for nearest, entry in zip(solution.field.nearest(tau, x), expected, strict=True):
+        np.testing.assert_array_equal(nearest, entry)
+
+
 def test_a_control_inside_the_box_may_be_the_best():
     problem = Calming()
     x = torch.linspace(-0.9, 0.9, 19, dtype=torch.float64).unsqueeze(-1)

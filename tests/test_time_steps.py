@@ -12,7 +12,7 @@ from pirl_rl.commands.composition import compose
 from pirl_rl.configuration import load_config, save_config
 from pirl_rl.errors import ArgumentError, ConfigError
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.problems import Reach1D, Safety1D
+from pirl_rl.problems import Reach1D, Safety1D, ZermeloBoat
 from pirl_rl.rates import across_box, across_sets, control_rate, fastest_rate
 from pirl_rl.sets import Box
 from pirl_rl.simulator import Simulator
@@ -359,3 +359,23 @@ def test_numbers_of_paths_that_are_given_stay():
     choose_time_steps(config, Safety1D())
     choose_paths(config, Safety1D(), make_evaluation_simulator(config, Safety1D()))
     assert (config.evaluation.success.episodes, config.evaluation.progress.episodes) == (77, 15)
+
+
+class Rocks(ZermeloBoat):
+    """The boat among rocks, which are parts of one avoid set."""
+
+    def __init__(self, *rocks: float):
+        super().__init__()
+        self.rocks = rocks
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        return torch.stack([(x - rock).norm(dim=-1) - 0.02 for rock in self.rocks], -1)
+
+
+def test_the_parts_of_a_set_have_the_rates_that_each_has_alone():
+    rng = torch.Generator().manual_seed(0)
+    x, u = (box.sample(500, rng, torch.float64) for box in (ZermeloBoat.states, ZermeloBoat.controls))
+    rocks = (-0.3, 0.1, 0.4)
+    together = across_sets(Rocks(*rocks), x, u)
+    assert len(together) == 1 + len(rocks)
+    assert together[1:] == [across_sets(Rocks(rock), x, u)[1] for rock in rocks]
