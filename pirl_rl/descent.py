@@ -54,6 +54,21 @@ def descended(constraints: Callable[[Tensor], Tensor], x: Tensor, box: Box, step
     return box.wrap(box.denormalize(z.detach()))
 
 
+def descended_parts(levels: Callable[[Tensor], Tensor], own: Tensor, x: Tensor, box: Box, steps: int = STEPS) -> Tensor:
+    """The ends (parts, N, n) of `descended` for each part of a set from states (parts, N, n), all parts at once.
+
+    Args:
+        levels: the levels (M, k) of all parts at states (M, n), differentiable.
+        own: which of them each part has (parts, k), bool; all of these are <= 0 in the part.
+        x: where the descents of each part start.
+        box: gives the scale of the steps.
+        steps: their number.
+    """
+    others = ~own.repeat_interleave(x.shape[1], 0)
+    ends = descended(lambda y: levels(y).masked_fill(others, -torch.inf), x.flatten(0, 1), box, steps)
+    return ends.unflatten(0, x.shape[:2])
+
+
 def starts_of_a_part(wanted: int, parts: int) -> int:
     """The number of descents of each part of a set: the wanted one, or fewer where the set has more parts than
     `MOST_PARTS`."""

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pirl_rl.descent import bisected, descended, starts_of_a_part
+from pirl_rl.descent import bisected, descended_parts, starts_of_a_part
 from pirl_rl.problem import ReachAvoidProblem
 
 STARTS = 64
@@ -127,12 +127,9 @@ def _across(
         u: physical controls (N, m).
     """
     here, count = levels(x), starts_of_a_part(STARTS, len(own))
-    lowest = [x[here[:, part].amax(-1).argsort()[:count]] for part in own]
-    others = ~own.repeat_interleave(len(lowest[0]), 0)
-    # All parts descend at once, since a union may have many.
-    deep = descended(lambda x: levels(x).masked_fill(others, -torch.inf), torch.cat(lowest), problem.states)
-    moves = []
-    for part, starts, ends in zip(own, lowest, deep.split(len(lowest[0])), strict=True):
+    lowest = torch.stack([x[here[:, part].amax(-1).argsort()[:count]] for part in own])
+    deep, moves = descended_parts(levels, own, lowest, problem.states), []
+    for part, starts, ends in zip(own, lowest, deep, strict=True):
         moves += _across_part(problem, name, lambda x, part=part: levels(x)[..., part], x, u, starts, ends)
     return moves
 

@@ -17,7 +17,7 @@ from pirl_rl.errors import ConfigError
 
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 WITH_SETTINGS = {"own", "reach1d", "reach1d_paper", *(name for name in EXPERIMENTS if name.startswith("drift"))}
-"""The experiments with settings of their own, and one with a problem and one without; the others choose a problem."""
+"""The experiments with settings of their own, and `own` and `reach1d`, for all that choose nothing but a problem."""
 
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml") if path.stem != "grid")
 """The methods that learn."""

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pirl_rl.descent import FEWER_STEPS, STEPS, bisected, descended, starts_of_a_part
+from pirl_rl.descent import FEWER_STEPS, STEPS, bisected, descended_parts, starts_of_a_part
 from pirl_rl.errors import ArgumentError, ProblemError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.initial_states import InitialStates, mixed, sample_interior
@@ -168,18 +168,13 @@ def _inside(
     A few sampled points are joined to the others, since they would be drawn again and again.
     """
     count = starts_of_a_part(DESCENTS, len(own))
-    others = ~own.repeat_interleave(count, 0)
     few = [len(points) < DESCENTS for points in sampled]
-
-    def of_part(x: Tensor) -> Tensor:
-        return levels(x).masked_fill(others, -torch.inf)
-
-    starts = problem.states.sample(len(others), rng, torch.float64)
-    deep = descended(of_part, starts, problem.states, STEPS if any(few) else FEWER_STEPS)
-    holds = (of_part(deep) <= 0).all(-1) & absorbs(deep)
+    starts = problem.states.sample(len(own) * count, rng, torch.float64).unflatten(0, (len(own), count))
+    deep = descended_parts(levels, own, starts, problem.states, STEPS if any(few) else FEWER_STEPS)
     parts = []
-    for points, ends, held, joined in zip(sampled, deep.split(count), holds.split(count), few, strict=True):
-        ways = [torch.cat([points, ends[held]])] if joined else [points, ends[held]]
+    for part, points, ends, joined in zip(own, sampled, deep, few, strict=True):
+        found = ends[(levels(ends)[:, part] <= 0).all(-1) & absorbs(ends)]
+        ways = [torch.cat([points, found])] if joined else [points, found]
         parts.append([inside for inside in ways if len(inside)])
     return parts
 
