@@ -19,6 +19,7 @@ STATEMENTS = (
     "import torchrl.collectors, torchrl.envs, torchrl.objectives",
     "from pirl_rl import ReachAvoidProblem",
     "from pirl_rl import train",
+    "import pirl_rl.commands.train",
 )
 MEASURE = "import time; start = time.process_time(); {statement}; print(time.process_time() - start)"
 

@@ -25,6 +25,7 @@ SETTINGS = {
     "seed": 3,
     "compile": False,
     "debug": "default",
+    "figures": False,
     "evaluation": {"during": ["exact"], "final": ["success"]},
     "env.num_envs": 32,
     "collector": {"frames_per_batch": 64, "warmup_frames": 64},
@@ -53,7 +54,7 @@ class Windy(Reach1D):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("api") / "run"
-    return folder, pirl_rl.train("reach1d", folder=folder, **SETTINGS)
+    return folder, pirl_rl.train("reach1d", folder=folder, **{**SETTINGS, "figures": True})
 
 
 def test_python_and_the_command_line_train_the_same_run(run, tmp_path):
@@ -164,15 +165,15 @@ def test_an_object_is_trained_and_given_again_to_open_its_run(tmp_path):
     assert pirl_rl.evaluate(again)["success_rate"] == pirl_rl.evaluate(trained)["success_rate"]
 
 
-def test_a_run_of_an_object_goes_on_with_the_object(tmp_path):
+def test_a_run_of_an_object_goes_on_with_the_object(in_process, tmp_path):
     """It ends as a run that was not interrupted; the command line says what to do in place of it."""
     problem = Reach1D(horizon=1.0)
-    settings = {**SETTINGS, "learner.decay": "constant", "report": False, "figures": False}
+    settings = {**SETTINGS, "learner.decay": "constant"}
     whole = pirl_rl.train(problem, folder=tmp_path / "whole", **settings)
     pirl_rl.train(problem, folder=tmp_path / "cut", **{**settings, "updates": 6})
-    done = command(f"resume={tmp_path / 'cut'}", cwd=tmp_path)
-    assert done.returncode == 1
-    assert "pirl_rl.train(problem, resume=folder)" in done.stderr
+    code, text = in_process(pirl_rl.train)(f"resume={tmp_path / 'cut'}")
+    assert code == 1
+    assert "pirl_rl.train(problem, resume=folder)" in text
     again = pirl_rl.train(problem, resume=tmp_path / "cut", updates=12)
     assert again.update == 12
     assert again.problem is problem
@@ -185,7 +186,7 @@ def test_a_run_of_an_object_goes_on_with_the_object(tmp_path):
 
 
 def test_a_population_of_an_object_goes_on_with_the_object(tmp_path):
-    problem, settings = Reach1D(horizon=1.0), {**SETTINGS, "report": False, "figures": False}
+    problem, settings = Reach1D(horizon=1.0), dict(SETTINGS)
     del settings["seed"]
     pirl_rl.train(problem, folder=tmp_path / "out", seeds=[0, 1], **settings)
     runs = pirl_rl.train(problem, resume=tmp_path / "out")
@@ -212,7 +213,7 @@ def test_a_class_that_can_be_imported_is_named_by_the_configuration(tmp_path):
 
 def test_a_class_takes_its_arguments_from_the_settings(tmp_path):
     """By keys with dots or by a nested mapping, also those that the configuration does not have."""
-    few = {**SETTINGS, "updates": 2, "report": False, "figures": False}
+    few = {**SETTINGS, "updates": 2}
     run = pirl_rl.train(Windy, folder=tmp_path / "run", **few, **{"env.problem.wind": -0.25})
     assert run.problem.wind == -0.25
     nested = {"env.problem._target_": "my_module.MyProblem", "env": {"problem": {"wind": -0.25}}}
@@ -296,10 +297,11 @@ def test_the_package_itself_imports_nothing_heavy():
     assert python(f"import sys, pirl_rl; print([name for name in {heavy} if name in sys.modules])") == "[]\n"
 
 
-def test_training_itself_knows_no_hydra():
-    names = ("hydra", "omegaconf", "wandb", "pirl_rl.configuration")
-    text = f"import sys, pirl_rl.trainer, pirl_rl.loggers; print([name for name in {names} if name in sys.modules])"
-    assert python(text) == "[]\n"
+def test_training_itself_knows_no_hydra_and_its_command_waits_for_no_figures():
+    names, slow = ("hydra", "omegaconf", "wandb", "pirl_rl.configuration"), ("matplotlib", "plotly", "scipy.stats")
+    text = f"import sys, pirl_rl.trainer, pirl_rl.loggers; print([name for name in {names} if name in sys.modules]); "
+    text += f"import pirl_rl.api, pirl_rl.commands.train; print([name for name in {slow} if name in sys.modules])"
+    assert python(text) == "[]\n[]\n"
 
 
 @pytest.mark.parametrize(

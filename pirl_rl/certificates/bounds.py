@@ -7,7 +7,7 @@ from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import beta, binom
+from scipy.special import bdtr, betaincinv
 
 from pirl_rl.errors import ArgumentError
 
@@ -30,7 +30,7 @@ def lower_bound(successes: ArrayLike, trials: int, confidence: float) -> np.ndar
         ArgumentError: there is no trial, a number of successes is impossible, or the level is not in (0, 1).
     """
     count = _checked(successes, trials, confidence)
-    return np.where(count > 0, beta.ppf(1 - confidence, np.maximum(count, 1), trials - count + 1), 0.0)
+    return np.where(count > 0, betaincinv(np.maximum(count, 1), trials - count + 1, 1 - confidence), 0.0)
 
 
 def upper_bound(successes: ArrayLike, trials: int, confidence: float) -> np.ndarray:
@@ -53,7 +53,8 @@ def order_of_quantile(samples: int, share: float, confidence: float) -> int | No
     Returns:
         k in 1, ..., samples, or None where there are too few samples for any bound.
     """
-    order = int(binom.ppf(confidence, samples, 1 - share)) + 1
+    below = bdtr(np.arange(samples + 1.0), samples, 1 - share)  # that at most k samples are below the quantile
+    order = int(np.searchsorted(below, confidence)) + 1
     return order if order <= samples else None
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from scipy.optimize import brentq
-from scipy.stats import chi2
+from scipy.special import ndtri
 from torch import Tensor
 
 STEP = 1e-4
@@ -79,7 +79,7 @@ def lipschitz_constant(sample: np.ndarray, confidence: float) -> Lipschitz:
         return Lipschitz(largest, largest, largest)
     ends = maxima.max() + spread * GAPS
     likelihood = np.array([_log_likelihood(end - maxima) for end in ends])
-    near = np.flatnonzero(likelihood >= likelihood.max() - chi2.ppf(2 * confidence - 1, 1) / 2)
+    near = np.flatnonzero(likelihood >= likelihood.max() - ndtri(confidence) ** 2 / 2)
     best, last = int(likelihood.argmax()), int(near[-1])
     beyond = len(ends) - 1
     estimate, upper = (None if k == beyond else max(largest, float(ends[k])) for k in (best, last))

@@ -11,13 +11,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from pirl_rl.assembly import make_trainer
 from pirl_rl.commands.console import outcome
-from pirl_rl.commands.report import draw_again
 from pirl_rl.commands.start import take_start
 from pirl_rl.configuration import save_config
 from pirl_rl.continuation import restore
 from pirl_rl.errors import ConfigError
 from pirl_rl.evaluation import Evidence, lines_of, meanings_of
-from pirl_rl.figures import draw_run
 from pirl_rl.files import remove_folder
 from pirl_rl.lock import locked
 from pirl_rl.machine import record_session
@@ -103,9 +101,13 @@ def show_run(
     """
     print(outcome(lines_of(evidence), summary, meanings, config.get("verbose", False)))
     if config.get("figures", True):
+        from pirl_rl.figures import draw_run  # with matplotlib, which takes a second that no training should wait for
+
         for figure in draw_run(solution, run.metrics, run.figures, evidence):
             print(f"figure   {figure}")
     if config.get("report", True):
+        from pirl_rl.commands.report import draw_again  # with matplotlib too
+
         draw_again(run.path, trust, solution.problem)
     print(f"run      {run}")
 

@@ -37,12 +37,15 @@ def compose_run(experiment: str, settings: Mapping[str, Any]) -> tuple[DictConfi
     groups = {path.name for path in CONF.iterdir() if path.is_dir()}
     try:
         chosen = {name: value for name, value in settings.items() if name in groups and isinstance(value, str)}
-        base = compose("train", [f"+experiment={experiment}"], with_hydra=True)
-        listed = base.hydra.runtime.choices
         typed = [f"+experiment={experiment}"]
+        config = compose("train", typed, with_hydra=True)
+        listed = config.hydra.runtime.choices
         typed += [f"{name if name in listed else f'+{name}'}={value}" for name, value in chosen.items()]
+        if chosen:
+            config = compose("train", typed, with_hydra=True)
+        run_folder(config)  # of Hydra's own settings none is one of the run
         others = {name: value for name, value in settings.items() if name not in chosen}
-        typed += typed_settings(others, compose("train", typed), "trainer", groups)
+        typed += typed_settings(others, config, "trainer", groups)
         return compose("train", typed, with_hydra=True), typed
     except HydraException as error:
         raise ConfigError(str(error)) from error

@@ -77,9 +77,10 @@ def main(arguments: Sequence[str]) -> None:
         folder, others = Path(options["out"]), {}
         for name in options["problems"]:
             truth = _truth(folder / name, name, overrides, options["states"])
-            trust = _trusted([*PROBLEMS[name], *overrides])
+            typed = [*PROBLEMS[name], *overrides]
+            trust = named_modules(typed, compose("train", typed).trust)
             own = [
-                _score(folder / name / str(seed), name, [*overrides, f"seed={seed}"], truth, options["rollouts"])
+                _score(folder / name / str(seed), name, [*overrides, f"seed={seed}"], truth, options["rollouts"], trust)
                 for seed in options["seeds"]
             ]
             others[name] = {
@@ -179,8 +180,13 @@ def _score_file(truth: Truth, rollouts: int) -> str:
     return f"score-{len(truth.x)}-{rollouts}.json"
 
 
-def _score(folder: Path, name: str, overrides: Sequence[str], truth: Truth, rollouts: int) -> Score:
-    """The score of a run in the folder, which is trained and measured first, as far as that is not done."""
+def _score(
+    folder: Path, name: str, overrides: Sequence[str], truth: Truth, rollouts: int, trust: Sequence[str]
+) -> Score:
+    """The score of a run in the folder, which is trained and measured first, as far as that is not done.
+
+    It imports modules that the settings of this command trust, whatever the run's own configuration says.
+    """
     path, run = folder / _score_file(truth, rollouts), RunDirectory(folder)
     typed = [*PROBLEMS[name], *overrides]
     refuse_other_settings(run, typed, "out")
@@ -190,22 +196,17 @@ def _score(folder: Path, name: str, overrides: Sequence[str], truth: Truth, roll
         print(f"{name}: {' '.join(overrides)}", flush=True)
         with reported(folder):
             if run.config.is_file():
-                go_on(folder, [], _trusted(typed))
+                go_on(folder, [], trust)
             else:
                 train_new(compose("train", typed), folder, typed)
     summary = json.loads(run.summary.read_text(encoding="utf-8"))
-    trained = load_run(folder, trust=_trusted(typed))
+    trained = load_run(folder, trust=trust)
     score = measure(
         trained.solution, trained.simulator, truth, rollouts, summary["wall_seconds"], int(summary.get("updates", 0))
     )
     with replacing(path) as file:
         file.write(json.dumps(asdict(score), indent=2) + "\n")
     return score
-
-
-def _trusted(typed: Sequence[str]) -> list[str]:
-    """The modules that settings of this command allow a run to import, whatever the run's own configuration says."""
-    return named_modules(typed, compose("train", typed).trust)
 
 
 def _alternative(
