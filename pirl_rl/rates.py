@@ -18,6 +18,7 @@ from torch import Tensor
 
 from pirl_rl.descent import bisected, descended_parts, starts_of_a_part
 from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.structure import AbsorbingSet, absorbing_sets
 
 STARTS = 64
 """The number of states of lowest level from which the descent to deep points of a part of a set starts."""
@@ -68,15 +69,7 @@ def across_sets(problem: ReachAvoidProblem, x: Tensor, u: Tensor) -> list[Move]:
         x: states (N, n), from which the sets are searched too.
         u: physical controls (N, m).
     """
-    moves = []
-    if problem.objective == "reach-avoid":
-        levels = problem.scaled_reached_constraints
-        moves += _across(problem, "the target", levels, torch.ones_like(levels(x[:1]), dtype=torch.bool), x, u)
-    if problem.has_avoid_set:
-        # B is a union: each of its constraints is a set of its own.
-        levels = problem.scaled_avoid_constraints
-        moves += _across(problem, "the avoid set", levels, torch.eye(levels(x[:1]).shape[-1], dtype=torch.bool), x, u)
-    return moves
+    return [move for one in absorbing_sets(problem) for move in _across(problem, one, x, u)]
 
 
 def fastest_rate(problem: ReachAvoidProblem, x: Tensor, u: Tensor) -> float:
@@ -113,23 +106,13 @@ def control_rate(problem: ReachAvoidProblem, x: Tensor, u: Tensor) -> float:
     return (reach * noise).amax(-1).nanmedian().item()
 
 
-def _across(
-    problem: ReachAvoidProblem, name: str, levels: Callable[[Tensor], Tensor], own: Tensor, x: Tensor, u: Tensor
-) -> list[Move]:
-    """The rates across each constraint of each part of a set, at points inside the part.
-
-    Args:
-        problem: the physics.
-        name: of the set.
-        levels: the k constraints (N, k) of all parts at states (N, n).
-        own: which of them each part has (parts, k), bool; all of these hold in the part.
-        x: states (N, n).
-        u: physical controls (N, m).
-    """
-    here, count = levels(x), starts_of_a_part(STARTS, len(own))
-    lowest = torch.stack([x[here[:, part].amax(-1).argsort()[:count]] for part in own])
-    deep, moves = descended_parts(levels, own, lowest, problem.states), []
-    for part, starts, ends in zip(own, lowest, deep, strict=True):
+def _across(problem: ReachAvoidProblem, absorbing: AbsorbingSet, x: Tensor, u: Tensor) -> list[Move]:
+    """The rates across each level of each part of a set at controls u (N, m), from the states x (N, n)."""
+    name, levels, parts = f"the {absorbing.name}", absorbing.levels, absorbing.parts
+    here, count = levels(x), starts_of_a_part(STARTS, len(parts))
+    lowest = torch.stack([x[here[:, part].amax(-1).argsort()[:count]] for part in parts])
+    deep, moves = descended_parts(levels, parts, lowest, problem.states), []
+    for part, starts, ends in zip(parts, lowest, deep, strict=True):
         moves += _across_part(problem, name, lambda x, part=part: levels(x)[..., part], x, u, starts, ends)
     return moves
 

@@ -1,9 +1,11 @@
-"""The structure of a problem, judged at random states and controls.
-
-It has the number of noise channels, how drift and noise depend on the control, and whether all parts fit together.
+"""The structure of a problem: the sets at which paths end, the number of noise channels, how drift and noise depend on
+the control, and whether all parts fit together. Functions are judged at random states and controls.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,6 +21,41 @@ PERIOD_POINTS = 1_000
 
 PERIOD_TOLERANCE = 1e-4
 """The relative difference at both ends of a period that counts as rounding, also of a function in single precision."""
+
+
+class AbsorbingSet(NamedTuple):
+    """A set at which paths end, as a union of parts: a part is where all of its levels are at most 0.
+
+    Attributes:
+        name: of the set, for messages.
+        contains: whether states (N, n) are in the set, (N,) bool.
+        value: V in the set.
+        levels: the k levels (N, k) of all parts at states (N, n).
+        parts: which of them each part has (parts, k), bool.
+    """
+
+    name: str
+    contains: Callable[[Tensor], Tensor]
+    value: float
+    levels: Callable[[Tensor], Tensor]
+    parts: Tensor
+
+
+def absorbing_sets(problem: ReachAvoidProblem) -> list[AbsorbingSet]:
+    """A, whose constraints make one part, and B, of which each constraint is a part; a set that is absent is left out.
+
+    In an invariance problem A does not end paths, and is left out too.
+    """
+    sets, center = [], problem.states.denormalize(torch.zeros(1, problem.states.dim))
+    if problem.objective == "reach-avoid":
+        levels = problem.scaled_reached_constraints
+        whole = torch.ones_like(levels(center), dtype=torch.bool)
+        sets.append(AbsorbingSet("target", problem.reached, 1.0, levels, whole))
+    if problem.has_avoid_set:
+        levels = problem.scaled_avoid_constraints
+        each = torch.eye(levels(center).shape[-1], dtype=torch.bool)
+        sets.append(AbsorbingSet("avoid set", problem.failed, 0.0, levels, each))
+    return sets
 
 
 def noise_channels(problem: ReachAvoidProblem) -> int:

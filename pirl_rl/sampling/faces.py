@@ -8,7 +8,6 @@ however small they are.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -18,6 +17,7 @@ from pirl_rl.descent import FEWER_STEPS, STEPS, bisected, descended_parts, start
 from pirl_rl.errors import ArgumentError, ProblemError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.initial_states import InitialStates, mixed, sample_interior
+from pirl_rl.structure import AbsorbingSet, absorbing_sets
 
 FACE_POOL = 16_384
 """The number of points on the faces that are found once, and from which samples are drawn."""
@@ -60,24 +60,24 @@ def find_faces(problem: ReachAvoidProblem, rng: torch.Generator) -> Faces:
     if len(interior) < DESCENTS:
         interior = torch.cat([interior, sample_interior(problem, problem.states, DESCENTS, rng, torch.float64)])
     found = []
-    for name, absorbs, value, levels, own in _sets(problem):
+    for absorbing in absorbing_sets(problem):
         # All parts are asked at once, since a union may have many.
-        holds, absorbed = levels(candidates) <= 0, absorbs(candidates)
-        sampled = [candidates[holds[:, part].all(-1) & absorbed] for part in own]
-        parts = [ways for ways in _inside(absorbs, levels, own, sampled, problem, rng) if ways]
+        holds, absorbed = absorbing.levels(candidates) <= 0, absorbing.contains(candidates)
+        sampled = [candidates[holds[:, part].all(-1) & absorbed] for part in absorbing.parts]
+        parts = [ways for ways in _inside(absorbing, sampled, problem, rng) if ways]
         if not parts:
             raise ProblemError(
-                f"{type(problem).__name__}: no point of the {name} was found, neither among {len(candidates)} points "
-                f"of {wide} nor by descent of its levels; expected a set that overlaps this box, and levels that fall "
-                "towards it"
+                f"{type(problem).__name__}: no point of the {absorbing.name} was found, neither among "
+                f"{len(candidates)} points of {wide} nor by descent of its levels; expected a set that overlaps this "
+                "box, and levels that fall towards it"
             )
         # Each part of a union has the same number of points, however small it is, half of them from each way.
         count = FACE_POOL // 2 // len(parts)
         a = torch.cat([_drawn(inside, count // len(ways), rng) for ways in parts for inside in ways])
         b = _drawn(interior, len(a), rng)
-        face = bisected(absorbs, a, b)
+        face = bisected(absorbing.contains, a, b)
         near = wide.contains(face)
-        found.append((face[near], torch.full((int(near.sum()),), value), b[near]))
+        found.append((face[near], torch.full((int(near.sum()),), absorbing.value), b[near]))
     if not found:
         raise ProblemError(f"{type(problem).__name__}: expected a target or an avoid set, got neither")
     return _single(*(torch.cat(parts) for parts in zip(*found, strict=True)))
@@ -138,42 +138,22 @@ class NearFaces:
         return self._found[1]
 
 
-Levels = Callable[[Tensor], Tensor]
-
-
-def _sets(problem: ReachAvoidProblem) -> list[tuple[str, Levels, float, Levels, Tensor]]:
-    """A and B, as far as they absorb: name, membership, V, the k levels, and which of them each part has (parts, k)."""
-    sets: list[tuple[str, Levels, float, Levels, Tensor]] = []
-    one = problem.states.sample(1, torch.Generator().manual_seed(0))
-    if problem.objective == "reach-avoid":
-        levels = problem.scaled_reached_constraints
-        sets.append(("target", problem.reached, 1.0, levels, torch.ones_like(levels(one), dtype=torch.bool)))
-    if problem.has_avoid_set:
-        levels = problem.scaled_avoid_constraints
-        sets.append(("avoid set", problem.failed, 0.0, levels, torch.eye(levels(one).shape[-1], dtype=torch.bool)))
-    return sets
-
-
 def _inside(
-    absorbs: Levels,
-    levels: Levels,
-    own: Tensor,
-    sampled: list[Tensor],
-    problem: ReachAvoidProblem,
-    rng: torch.Generator,
+    absorbing: AbsorbingSet, sampled: list[Tensor], problem: ReachAvoidProblem, rng: torch.Generator
 ) -> list[list[Tensor]]:
     """Points (K, n) of each part of a set: those that were sampled, and others that descents find, as far as there are
     any.
 
     A few sampled points are joined to the others, since they would be drawn again and again.
     """
+    levels, own = absorbing.levels, absorbing.parts
     count = starts_of_a_part(DESCENTS, len(own))
     few = [len(points) < DESCENTS for points in sampled]
     starts = problem.states.sample(len(own) * count, rng, torch.float64).unflatten(0, (len(own), count))
     deep = descended_parts(levels, own, starts, problem.states, STEPS if any(few) else FEWER_STEPS)
     parts = []
     for part, points, ends, joined in zip(own, sampled, deep, few, strict=True):
-        found = ends[(levels(ends)[:, part] <= 0).all(-1) & absorbs(ends)]
+        found = ends[(levels(ends)[:, part] <= 0).all(-1) & absorbing.contains(ends)]
         ways = [torch.cat([points, found])] if joined else [points, found]
         parts.append([inside for inside in ways if len(inside)])
     return parts
