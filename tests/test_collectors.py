@@ -17,6 +17,7 @@ from pirl_rl.collectors.transitions import TRANSITION, Exploration, Transitions
 from pirl_rl.continuation import restore
 from pirl_rl.errors import CollectorError
 from pirl_rl.problems.reach1d_env import Reach1DEnv
+from pirl_rl.trainer import Trainer
 
 ASYNC = ("collector=multi_async", "collector.updates_per_batch=2", "collector.warmup_frames=128")
 
@@ -215,26 +216,17 @@ def test_a_checkpoint_keeps_its_transitions_while_workers_write(tmp_path):
     assert (kept["next"]["number"] == 0).all()
 
 
-def test_workers_feed_resume_die_and_leave_nothing(tmp_path):
-    """One start of processes for all that needs them: the rest of a worker's life in its order."""
-    first = small_trainer(tmp_path, *ASYNC, "trainer.updates=4", "method=pirl")
-    before = [parameter.clone() for parameter in first.learner.loss.parameters()]
-    first.train()
-    assert any((a != b).any() for a, b in zip(before, first.learner.loss.parameters(), strict=True))
-    assert not multiprocessing.active_children()
-
-    second = small_trainer(tmp_path, *ASYNC, "trainer.updates=1000000", "method=pirl")
-    restore(second)
-    collector = second.collector
+def assert_a_killed_worker_ends(trainer: Trainer) -> None:
+    """Train, and kill a worker in the twentieth update: the training says so and leaves no process behind."""
+    collector, begun = trainer.collector, trainer.update
     written = collector.buffer.write_count
-    assert written >= 128
     step, processes = collector.step, []
 
     def step_and_kill(k: int) -> None:
         step(k)
-        if k == 10:
+        if k == begun + 10:
             until(lambda: collector.buffer.write_count > written + 600)
-        if k == 20:
+        if k == begun + 20:
             processes.extend(collector._collector.procs)
             with collector._write_lock:  # which the worker then does not hold
                 os.kill(processes[1].pid, signal.SIGKILL)
@@ -242,9 +234,27 @@ def test_workers_feed_resume_die_and_leave_nothing(tmp_path):
 
     collector.step = step_and_kill
     with pytest.raises(CollectorError, match="worker 1 of 2 died, exit code -9"):
-        second.train()
-    assert second.update == 21
+        trainer.train()
+    assert trainer.update == begun + 21
     assert not multiprocessing.active_children()
+
+
+def test_workers_feed_die_and_leave_nothing(tmp_path):
+    trainer = small_trainer(tmp_path, *ASYNC, "trainer.updates=1000000", "method=pirl")
+    before = [parameter.clone() for parameter in trainer.learner.loss.parameters()]
+    assert_a_killed_worker_ends(trainer)
+    assert any((a != b).any() for a, b in zip(before, trainer.learner.loss.parameters(), strict=True))
+
+
+@pytest.mark.slow
+def test_workers_go_on_after_the_run_before(tmp_path):
+    small_trainer(tmp_path, *ASYNC, "trainer.updates=4", "method=pirl").train()
+    assert not multiprocessing.active_children()
+    trainer = small_trainer(tmp_path, *ASYNC, "trainer.updates=1000000", "method=pirl")
+    restore(trainer)
+    assert trainer.update == 4
+    assert trainer.collector.buffer.write_count >= 128
+    assert_a_killed_worker_ends(trainer)
 
 
 @pytest.mark.slow

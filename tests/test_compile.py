@@ -108,7 +108,7 @@ def test_a_new_rule_without_a_compiler_on_the_path(tmp_path):
     assert "run      " in done.stdout
 
 
-@pytest.mark.parametrize("experiment", ["reach1d", "dubins"])
+@pytest.mark.parametrize("experiment", ["reach1d", pytest.param("dubins", marks=pytest.mark.slow)])
 def test_the_default_losses_are_one_program_each(experiment, tmp_path, monkeypatch):
     """Traced whole by the compiler's front end; a loss that breaks into pieces costs several times as much."""
     calls = eager_calls(monkeypatch)
@@ -177,6 +177,7 @@ def test_evaluators_share_the_compiled_simulator_of_the_environment(settings, sh
     assert replace(simulator, dt=0.5).shared is None
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_all_evaluators_play_a_shared_simulator():
     """They play other numbers of paths than the environment; each would otherwise be compiled by itself."""

@@ -9,7 +9,8 @@ import os
 import pytest
 from small import small_trainer
 
-from pirl_rl import certify, evaluate, load_run
+from pirl_rl import evaluate, load_run
+from pirl_rl.commands import certify  # reads the arguments of Run.certify, which a test replaces
 from pirl_rl.errors import ConfigError
 from pirl_rl.run_directory import RunDirectory
 
@@ -39,7 +40,7 @@ def test_repeats_the_summary(run, capsys):
 
 def test_takes_other_samples(run):
     folder, summary = run
-    evaluate.main([f"run={folder}", "evaluation.final=[success]", "evaluation.success.episodes=2000"])
+    evaluate.main([f"run={folder}", "evaluation.final=[success]", "evaluation.success.episodes=2000", "figures=false"])
     results = json.loads((folder / "evaluation.json").read_text())
     width, before = (entry["success_high"] - entry["success_low"] for entry in (results, summary))
     assert "value_mse" not in results
@@ -53,7 +54,7 @@ def test_a_run_of_an_earlier_version_has_no_verbose(run, capsys):
     folder = run[0]
     config = RunDirectory(folder).config
     config.write_text("".join(line for line in config.read_text().splitlines(True) if not line.startswith("verbose")))
-    few = [f"run={folder}", "evaluation.final=[success]", "evaluation.success.episodes=50"]
+    few = [f"run={folder}", "evaluation.final=[success]", "evaluation.success.episodes=50", "figures=false"]
     evaluate.main(few)
     evaluate.main([*few, "verbose=true"])
     assert "success_rate" in capsys.readouterr().out
@@ -131,7 +132,7 @@ def test_help_is_the_docstring(capsys):
 def test_a_changed_problem_is_the_one_that_is_measured(run, capsys):
     """Within a tenth of the horizon hardly any path reaches the target."""
     folder, summary = run
-    evaluate.main([f"run={folder}", "evaluation.final=[success]", "env.problem.horizon=0.2", "report=false"])
+    evaluate.main([f"run={folder}", "evaluation.final=[success]", "env.problem.horizon=0.2", "figures=false"])
     results = json.loads((folder / "evaluation.json").read_text())
     assert results["success_rate"] < summary["success_rate"] / 2
     assert results["settings"]["problem"]["horizon"] == 0.2

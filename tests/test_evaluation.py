@@ -261,14 +261,14 @@ def test_every_metric_has_a_meaning_of_its_own_for_every_problem(name):
         "slices": Slices(6, 2),
         "rollouts": Rollouts(2, 6),
     }
-    simulator, sizes = Simulator(problem, problem.horizon / 4), set()
-    for evaluator in evaluators.values():
+    evidence, sizes = evaluate(solution, Simulator(problem, problem.horizon / 4), evaluators), set()
+    for name, evaluator in evaluators.items():
         meanings = evaluator.meanings(problem)
-        assert list(evaluator(solution, simulator).metrics()) == list(meanings)
+        assert list(evidence[name].metrics()) == list(meanings)
         sizes |= {word for text in meanings.values() for word in text.replace(",", " ").split() if word.isdigit()}
     assert {"12", "3", "41", "34", "5"} <= sizes
     meanings = {metric: text for group in meanings_of(evaluators, problem).values() for metric, text in group.items()}
-    assert set(metrics_of(evaluate(solution, simulator, evaluators))) == set(meanings)
+    assert set(metrics_of(evidence)) == set(meanings)
     for text in meanings.values():
         assert text[0].isupper()
         assert text.endswith(".")

@@ -393,21 +393,25 @@ class Calm(HalfSpace):
         return torch.special.ndtr(ahead) + reflected
 
 
-def test_weak_noise_in_three_dimensions_has_its_closed_form():
-    """The layer in which V rises from 0 to 1 is as wide as one cell of the coarser mesh, and a vertex is the best
-    control. Extrapolation from half the points leaves six tenths of the error at most."""
-    problem = Calm()
+@pytest.mark.parametrize(
+    ("dim", "counts", "bounds"),
+    [(2, (33, 49), (0.009, 0.003)), pytest.param(3, (17, 25), (0.018, 0.010), marks=pytest.mark.slow)],
+)
+def test_weak_noise_has_its_closed_form(dim, counts, bounds):
+    """A vertex is the best control, and with three states the layer in which V rises from 0 to 1 is as wide as one cell
+    of the coarser mesh. Extrapolation from half the points leaves six tenths of the error at most."""
+    problem = Calm(dim)
     tau, x = late_states(problem, 1_000)
     exact = problem.exact_value(tau, x)
-    coarser = GridSolver(problem, points=17, levels=2, estimate=False).solve()
-    finer = GridSolver(problem, points=25, levels=2).solve()
+    coarser = GridSolver(problem, points=counts[0], levels=2, estimate=False).solve()
+    finer = GridSolver(problem, points=counts[1], levels=2).solve()
     assert coarser.split
     assert finer.split
     extrapolated, estimate = (finer.value(tau, x) - exact).abs(), finer.error(tau, x)
     finer.coarse = None
     plain = (finer.value(tau, x) - exact).abs()
-    assert (coarser.value(tau, x) - exact).abs().mean() < 0.018
-    assert plain.mean() < 0.010
+    assert (coarser.value(tau, x) - exact).abs().mean() < bounds[0]
+    assert plain.mean() < bounds[1]
     assert extrapolated.mean() < 0.6 * plain.mean()
     assert (extrapolated <= estimate + 0.03).all()
 
@@ -715,14 +719,14 @@ def test_noise_that_depends_on_the_control_acts_in_turns_with_the_drift(count, m
 
 @pytest.fixture(scope="module")
 def dubins() -> GridSolution:
-    return GridSolver(DubinsCar(), points=41, estimate=False).solve()
+    return GridSolver(DubinsCar(), points=31, estimate=False).solve()
 
 
 def test_the_dubins_car_agrees_with_monte_carlo_of_its_own_policy(dubins):
     """With 100 paths from each of 60 states a perfect V would have about 0.016."""
     problem, solution = dubins.problem, dubins
     tau, x = (values[:60] for values in late_states(problem))
-    played = monte_carlo(problem, solution.policy, tau, x, rollouts=100, dt=0.02)
+    played = monte_carlo(problem, solution.policy, tau, x, rollouts=100, dt=0.04)
     assert (solution.value(tau, x) - played.probability).abs().mean() < 0.035
 
 
@@ -733,7 +737,7 @@ def test_v_rises_from_a_wall_that_paths_leave(dubins):
     away = torch.stack([distance - problem.wall, 0 * distance, 0 * distance], -1)
     tau = torch.full((4,), 4.0, dtype=torch.float64)
     value = solution.value(tau, away)
-    played = monte_carlo(problem, solution.policy, tau, away, rollouts=250, dt=0.01)
+    played = monte_carlo(problem, solution.policy, tau, away, rollouts=250, dt=0.02)
     assert (value - played.probability).abs().max() < 0.1
     layer = 1 - (-2 * problem.speed * distance / problem.noise[0] ** 2).exp()
     assert (value / value[-1] - layer)[:2].abs().max() < 0.01

@@ -16,7 +16,7 @@ from pirl_rl.grid import GridSolution, GridSolver
 from pirl_rl.problems import CartPole, DubinsCar, HalfSpace, Reach1D, ZermeloBoat
 from pirl_rl.runs.compare import find_runs
 
-SMALL = {"grid": {"points": 81}}
+SMALL = {"grid": {"points": 81}, "env.dt": 0.02}
 SMALL |= {
     "evaluation": {
         "success": {"episodes": 500},
@@ -118,9 +118,12 @@ def test_a_broken_or_foreign_file_is_refused(tmp_path):
         GridSolution.load(tmp_path / "nothing.npz", HalfSpace(dim=2))
 
 
+FEW = {"debug": "default", "env.dt": 0.05, "figures": False, "evaluation": {"during": [], "final": []}}
+
+
 def test_a_look_ahead_reaches_what_the_actor_does_not(tmp_path):
     """With a reversed actor, one control step through the model finds the best control of the exact value."""
-    run = pirl_rl.train("reach1d", folder=tmp_path / "run", updates=1, **{"debug": "default", "env.dt": 0.05})
+    run = pirl_rl.train("reach1d", folder=tmp_path / "run", updates=1, **FEW)
     x = torch.linspace(-1.5, 1.5, 30).unsqueeze(-1)
     problem = run.problem
     run.solution.value = lambda tau, state: problem.exact_value(tau, state)

@@ -19,7 +19,7 @@ SHORT = {
     "'collector.frames_per_batch': 51_200, 'collector.warmup_frames': 51_200, 'evaluation.success.episodes': 1_000, "
     "'evaluation.calibration.rollouts': 32, 'evaluation.slices.rollouts': 2, 'evaluation.verdict.points': 40, "
     "'evaluation.verdict.rollouts': 8}",
-    "02_drift": f"MODEL = {str(MODEL)!r}\nROLLOUTS = 200",
+    "02_drift": f"MODEL = {str(MODEL)!r}\nROLLOUTS = 100",
     "03_schedules": "UPDATES, ROUNDS, CANDIDATES = 100, 1, 1\n"
     "SETTINGS = '+experiment=reach1d compile=false check=false pirl.final=[1,1,10] env.dt=0.05 env.num_envs=256 "
     "collector.frames_per_batch=10240 collector.warmup_frames=10240 evaluation.calibration.rollouts=64 "
@@ -66,7 +66,7 @@ def test_notebook_executes(path, tmp_path, monkeypatch):
     does not enter, has far fewer updates.
 
     Drift: along the line success falls from 1 to 0 within three of the 57 points, and beside such a step a smooth V is
-    off by up to 0.5 though its own 0.5 is in the right place; 200 rollouts add standard errors of at most 0.035. So the
+    off by up to 0.5 though its own 0.5 is in the right place; 100 rollouts add standard errors of at most 0.05. So the
     largest error bounds the misplacement of both edges, and the mean says that V is right away from them: trained runs
     have 0.01 to 0.04, untrained ones 0.37 to 0.44.
 

@@ -210,7 +210,7 @@ def test_monte_carlo_and_paths_start_anywhere():
 def test_a_run_answers_outside_the_period_as_inside(tmp_path):
     settings = {"updates": 20, "compile": False, "debug": "default", "env.num_envs": 32}
     settings |= {"collector": {"frames_per_batch": 64, "warmup_frames": 64}}
-    settings |= {"evaluation": {"during": [], "final": []}}
+    settings |= {"evaluation": {"during": [], "final": []}, "figures": False}
     pirl_rl.train(Circle(), folder=tmp_path / "run", **settings)
     run = pirl_rl.load_run(tmp_path / "run", problem=Circle())
     x = np.array([[0.2], [0.8], [2.0], [-0.9]])

@@ -66,7 +66,7 @@ def test_the_python_block_trains(home, tmp_path, monkeypatch):
     """The third state lies in the drain: V and its Monte Carlo are exactly 0, and its path has failed."""
     monkeypatch.syspath_prepend(str(home))
     monkeypatch.chdir(tmp_path)
-    quick = "updates=30, debug='default', evaluation={'final': []}"
+    quick = "updates=30, debug='default', figures=False, evaluation={'final': []}"
     block, shortened = re.subn(r"\(Whirlpool, ", f"(Whirlpool, {quick}, ", TRAIN)
     assert shortened == 1
     names = {}

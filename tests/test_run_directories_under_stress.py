@@ -265,9 +265,9 @@ def test_two_processes_resume_one_directory(seed, finished, tmp_path):
 
 def test_a_start_from_another_method_is_told_in_one_sentence(tmp_path, cli):
     """TD3's critics have the action as an input, those of the default method do not."""
-    code, text = cli("+experiment=reach1d", "+debug=default", "method=td3", f"hydra.run.dir={tmp_path / 'td3'}")
+    code, text = cli(*RUN, "evaluation.final=[]", "method=td3", f"hydra.run.dir={tmp_path / 'td3'}")
     assert code == 0, text
-    code, text = cli("+experiment=reach1d", "+debug=default", f"start={tmp_path / 'td3'}")
+    code, text = cli(*RUN, f"start={tmp_path / 'td3'}")
     assert code == 1
     (line,) = [line for line in text.splitlines() if line.startswith("error: ")]
     assert "its critics have weights of the shapes (2, 32, " in line

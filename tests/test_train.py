@@ -409,7 +409,7 @@ def start(folder: Path, *arguments: str) -> subprocess.Popen:
 
 
 @pytest.mark.parametrize("collector", ["sync", pytest.param("multi_async", marks=pytest.mark.slow)])
-def test_interrupt_saves_and_tells_how_to_go_on(collector, tmp_path):
+def test_interrupt_saves_and_tells_how_to_go_on(collector, cli, tmp_path):
     child = start(tmp_path, f"collector={collector}", *SMALL[1:])
     child.send_signal(signal.SIGINT)
     text = child.communicate(timeout=60)[1]
@@ -418,8 +418,8 @@ def test_interrupt_saves_and_tells_how_to_go_on(collector, tmp_path):
     assert "Traceback" not in text
     run = only_run(tmp_path)
     assert load_run(run).update >= 1
-    done = command(f"resume={run}", f"trainer.updates={load_run(run).update + 1}", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    code, text = cli(f"resume={run}", f"trainer.updates={load_run(run).update + 1}")
+    assert code == 0, text
 
 
 @pytest.mark.slow

@@ -60,11 +60,11 @@ class Logarithm(Barrier):
 
 @pytest.mark.parametrize("problem", [Tank, Population, Barrier, Logarithm])
 def test_a_training_goes_on_where_paths_leave_the_physics(problem, tmp_path):
-    settings = {"updates": 40, "compile": False, "debug": "default", "check": False, "env.num_envs": 256}
+    settings = {"updates": 40, "compile": False, "debug": "default", "check": False, "figures": False}
     settings |= {
         "collector": {"frames_per_batch": 2_560, "warmup_frames": 2_560, "updates_per_batch": 5, "buffer_size": 5_120}
     }
-    settings |= {"env.dt": 0.05, "evaluation": {"during": [], "final": []}}
+    settings |= {"env.num_envs": 256, "env.dt": 0.05, "evaluation": {"during": [], "final": []}}
     run = pirl_rl.train(problem(horizon=2.0), folder=tmp_path, **settings)
     assert math.isfinite(float(run.value(2.0, [[1.0, 0.0]])[0]))
 

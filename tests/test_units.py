@@ -22,6 +22,7 @@ SETTINGS = {
     "seed": 0,
     "updates": 12,
     "debug": "default",
+    "figures": False,
     "evaluation": {"during": [], "final": []},
     "collector": {"frames_per_batch": 6_400, "warmup_frames": 6_400, "buffer_size": 12_800, "updates_per_batch": 4},
 }

@@ -45,7 +45,7 @@ def judged(solution, dt=0.02, **settings):
     return evidence, statements_of(evidence)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_few_paths_do_not_make_the_exact_solution_doubtful(seed):
     """With eight paths from each state the noise is 0.11 on average, far above the error that would be doubtful."""
     _, statements = judged(Known(HalfSpace()), rollouts=8, seed=seed)
@@ -248,7 +248,7 @@ def test_too_few_samples_are_refused(settings):
 def test_a_time_step_that_is_too_long_is_doubtful():
     """A regulator that holds its control for 0.4 s overshoots; the grid's value is that of a control without a hold."""
     solution = GridSolver(Safety1D()).solve()
-    assert judged(solution, dt=0.005)[1]["verdict"] == "solved"
+    assert judged(solution, dt=0.01)[1]["verdict"] == "solved"
     evidence, statements = judged(solution, dt=0.4, rollouts=256)
     assert statements["verdict"] != "solved"
     assert "With shorter time steps success changes by +0." in statements["verdict_reason"]
