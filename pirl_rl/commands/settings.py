@@ -43,7 +43,7 @@ def compose_run(experiment: str, settings: Mapping[str, Any]) -> tuple[DictConfi
         typed += [f"{name if name in listed else f'+{name}'}={value}" for name, value in chosen.items()]
         if chosen:
             config = compose("train", typed, with_hydra=True)
-        run_folder(config)  # of Hydra's own settings none is one of the run
+        run_folder(config)  # takes out Hydra's own settings, which are no settings of a run
         others = {name: value for name, value in settings.items() if name not in chosen}
         typed += typed_settings(others, config, "trainer", groups)
         return compose("train", typed, with_hydra=True), typed
