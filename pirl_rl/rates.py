@@ -113,7 +113,9 @@ def _across(problem: ReachAvoidProblem, absorbing: AbsorbingSet, x: Tensor, u: T
     lowest = torch.stack([x[here[:, part].amax(-1).argsort()[:count]] for part in parts])
     deep, moves = descended_parts(levels, parts, lowest, problem.states), []
     for part, starts, ends in zip(parts, lowest, deep, strict=True):
-        moves += _across_part(problem, name, lambda x, part=part: levels(x)[..., part], x, u, starts, ends)
+        # Of hundreds of parts of a union, none asks for all levels at all states again.
+        own = here[:, part]
+        moves += _across_part(problem, name, lambda x, part=part: levels(x)[..., part], own, x, u, starts, ends)
     return moves
 
 
@@ -121,30 +123,31 @@ def _across_part(
     problem: ReachAvoidProblem,
     name: str,
     constraints: Callable[[Tensor], Tensor],
+    here: Tensor,
     x: Tensor,
     u: Tensor,
     lowest: Tensor,
     deep: Tensor,
 ) -> list[Move]:
-    """The rates across each constraint of a set, from the states (K, n) of lowest level and the ends of their descent.
+    """The rates across each constraint of a part of a set, whose values at the states x (N, n) are `here` (N, k).
 
-    Where the physics has no number inside the set, they are those of states beside it.
+    They are taken at the states in the part, and half way between its face and the ends `deep` (K, n) of descents from
+    the states `lowest` (K, n). Where the physics has no number inside the part, they are those of states beside it.
     """
 
     def holds(x: Tensor) -> Tensor:
         return (constraints(x) <= 0).all(-1)
 
-    found = torch.cat([x, deep])
-    found = found[holds(found)]
+    inside = (here <= 0).all(-1)
+    found = torch.cat([here[inside], constraints(deep[holds(deep)])])
     if not len(found):
         return []
-    depths = (-constraints(found)).amax(0).tolist()
+    depths = (-found).amax(0).tolist()
     entering = holds(deep) & ~holds(lowest)
     face = bisected(holds, deep[entering], lowest[entering])
-    rates = _speeds(problem, constraints, torch.cat([x[holds(x)], (face + deep[entering]) / 2]), u)
-    outside = x[~holds(x)]
-    if rates.isnan().any() and len(outside):
-        beside = outside[constraints(outside).amax(-1).argsort()[:STARTS]]
+    rates = _speeds(problem, constraints, torch.cat([x[inside], (face + deep[entering]) / 2]), u)
+    if rates.isnan().any() and not inside.all():
+        beside = x[~inside][here[~inside].amax(-1).argsort()[:STARTS]]
         rates = torch.where(rates.isnan(), _speeds(problem, constraints, beside, u), rates)
     pairs = zip(depths, *rates.tolist(), strict=True)
     return [Move(name, v / depth, s / depth) for depth, v, s in pairs if depth > 0]
