@@ -182,8 +182,7 @@ def test_a_problem_that_cannot_be_mapped_is_refused_by_name(tmp_path):
 
 
 def test_a_refused_population_leaves_no_directory(tmp_path):
-    quick = {"updates": 3, "method": "pirl", "check": False, "evaluation.during": [], "evaluation.final": []}
-    settings = quick | {"compile": False, "schedule.initial": [1, 1, 1], "collector.warmup_frames": 256}
+    settings = {"updates": 3, "debug": "default", "schedule.initial": [1, 1, 1], "evaluation.final": []}
     with pytest.raises(ArgumentError, match=r"trainer\.seeds"):
         pirl_rl.train(Branches, folder=tmp_path / "out", seeds=[0, 1], **settings)
     assert not (tmp_path / "out").exists()

@@ -327,7 +327,7 @@ class NamedReef(Reef):
 
 
 def test_paths_take_a_shared_constraint_as_if_the_target_had_it():
-    x = Reef().states.sample(200, torch.Generator().manual_seed(0))
+    x = Reef().states.sample(100, torch.Generator().manual_seed(0))
     tau = torch.full((len(x),), Reef().horizon)
 
     def policy(tau, x):
