@@ -113,7 +113,7 @@ def _across(problem: ReachAvoidProblem, absorbing: AbsorbingSet, x: Tensor, u: T
     lowest = torch.stack([x[here[:, part].amax(-1).argsort()[:count]] for part in parts])
     deep, moves = descended_parts(levels, parts, lowest, problem.states), []
     for part, starts, ends in zip(parts, lowest, deep, strict=True):
-        # Of hundreds of parts of a union, none asks for all levels at all states again.
+        # The levels at all states are known: a union may have hundreds of parts, which need not compute them again.
         own = here[:, part]
         moves += _across_part(problem, name, lambda x, part=part: levels(x)[..., part], own, x, u, starts, ends)
     return moves

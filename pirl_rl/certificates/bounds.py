@@ -53,8 +53,9 @@ def order_of_quantile(samples: int, share: float, confidence: float) -> int | No
     Returns:
         k in 1, ..., samples, or None where there are too few samples for any bound.
     """
-    below = bdtr(np.arange(samples + 1.0), samples, 1 - share)  # that at most k samples are below the quantile
-    order = int(np.searchsorted(below, confidence)) + 1
+    # The probabilities that at most 0, 1, ... of the samples are below the quantile.
+    at_most = bdtr(np.arange(samples + 1.0), samples, 1 - share)
+    order = int(np.searchsorted(at_most, confidence)) + 1
     return order if order <= samples else None
 
 

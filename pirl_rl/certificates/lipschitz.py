@@ -79,6 +79,7 @@ def lipschitz_constant(sample: np.ndarray, confidence: float) -> Lipschitz:
         return Lipschitz(largest, largest, largest)
     ends = maxima.max() + spread * GAPS
     likelihood = np.array([_log_likelihood(end - maxima) for end in ends])
+    # The square of the normal quantile is that of the chi-square distribution with one degree, at 2 confidence - 1.
     near = np.flatnonzero(likelihood >= likelihood.max() - ndtri(confidence) ** 2 / 2)
     best, last = int(likelihood.argmax()), int(near[-1])
     beyond = len(ends) - 1

@@ -106,7 +106,7 @@ def show_run(
         for figure in draw_run(solution, run.metrics, run.figures, evidence):
             print(f"figure   {figure}")
     if config.get("report", True):
-        from pirl_rl.commands.report import draw_again  # with matplotlib too
+        from pirl_rl.commands.report import draw_again  # which draws with matplotlib as well
 
         draw_again(run.path, trust, solution.problem)
     print(f"run      {run}")
