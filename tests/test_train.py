@@ -58,7 +58,7 @@ def only_run(folder: Path) -> Path:
     return run
 
 
-# The others differ from one of these in their physics or their stages alone; `own` is trained by the command of the README.
+# The others differ from these in their physics or stages alone, and the command of the README trains `own`.
 TRAINED_BY_DEFAULT = ("drift", "reach1d_paper", "safety1d")
 EXPERIMENTS = [
     pytest.param(name, marks=[pytest.mark.slow] * (name not in TRAINED_BY_DEFAULT)) for name in names("experiment")
