@@ -440,10 +440,10 @@ class Adrift(ReachAvoidProblem):
 
 @pytest.mark.parametrize(
     ("problem", "count", "tolerance"),
-    [(Calm(1), 101, 0.0008), (Calm(2), 41, 0.0020), (Adrift(1), 41, 0.002), (Adrift(2), 41, 0.002)],
+    [(Calm(1), 101, 0.0008), (Adrift(1), 41, 0.002), (Adrift(2), 41, 0.002)],
 )
-def test_weak_noise_in_fewer_dimensions_has_its_closed_form(problem, count, tolerance):
-    """With plain first steps the errors are 0.0036, 0.0014, 0.009 and 0.008."""
+def test_first_steps_follow_weak_noise_to_its_closed_form(problem, count, tolerance):
+    """With plain first steps the errors are 0.0036, 0.009 and 0.008."""
     tau, x = late_states(problem, 1_000)
     solution = GridSolver(problem, points=count).solve()
     assert solution.split
