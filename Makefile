@@ -40,8 +40,7 @@ clean: ## Remove .venv, caches and build output; runs stay
 	rm -rf $(VENV) build dist docs/_build docs/_generated *.egg-info .pytest_cache .ruff_cache .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# pip comes last into a new environment and .setup last of all, so what was interrupted starts again. To compile all
-# modules takes half of an installation, and most of them are never imported.
+# pip comes last into a new environment and .setup last of all, so what was interrupted starts again.
 $(BIN)/pip:
 	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) not found: name a Python 3.11 or newer with PYTHON=..." >&2; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, $(PYTHON) is " + sys.version.split()[0] + ": name another with PYTHON=...")'
@@ -49,5 +48,5 @@ $(BIN)/pip:
 	$(PYTHON) -m venv --clear $(VENV)
 
 $(READY): pyproject.toml constraints.txt | $(BIN)/pip
-	$(BIN)/python -m pip install --no-compile -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install -c constraints.txt -e '.[dev]'
 	@touch $@
