@@ -106,51 +106,56 @@ def control_rate(problem: ReachAvoidProblem, x: Tensor, u: Tensor) -> float:
     return (reach * noise).amax(-1).nanmedian().item()
 
 
-def _across(problem: ReachAvoidProblem, absorbing: AbsorbingSet, x: Tensor, u: Tensor) -> list[Move]:
-    """The rates across each level of each part of a set at controls u (N, m), from the states x (N, n)."""
-    name, levels, parts = f"the {absorbing.name}", absorbing.levels, absorbing.parts
-    here, count = levels(x), starts_of_a_part(STARTS, len(parts))
-    lowest = torch.stack([x[here[:, part].amax(-1).argsort()[:count]] for part in parts])
-    deep, moves = descended_parts(levels, parts, lowest, problem.states), []
-    for part, starts, ends in zip(parts, lowest, deep, strict=True):
-        # The levels at all states are known: a union may have hundreds of parts, which need not compute them again.
-        own = here[:, part]
-        moves += _across_part(problem, name, lambda x, part=part: levels(x)[..., part], own, x, u, starts, ends)
-    return moves
+class SearchedPart(NamedTuple):
+    """What is known about a part of a set.
 
-
-def _across_part(
-    problem: ReachAvoidProblem,
-    name: str,
-    constraints: Callable[[Tensor], Tensor],
-    here: Tensor,
-    x: Tensor,
-    u: Tensor,
-    lowest: Tensor,
-    deep: Tensor,
-) -> list[Move]:
-    """The rates across each constraint of a part of a set, whose values at the states x (N, n) are `here` (N, k).
-
-    They are taken at the states in the part, and half way between its face and the ends `deep` (K, n) of descents from
-    the states `lowest` (K, n). Where the physics has no number inside the part, they are those of states beside it.
+    Attributes:
+        constraints: its levels at any states, (*, n) to (*, k).
+        here: their values at the sampled states, (N, k).
+        starts, ends: states (K, n) from which the levels were descended, and those to which descent led.
     """
 
-    def holds(x: Tensor) -> Tensor:
-        return (constraints(x) <= 0).all(-1)
+    constraints: Callable[[Tensor], Tensor]
+    here: Tensor
+    starts: Tensor
+    ends: Tensor
 
-    inside = (here <= 0).all(-1)
-    found = torch.cat([here[inside], constraints(deep[holds(deep)])])
+    def contains(self, x: Tensor) -> Tensor:
+        return (self.constraints(x) <= 0).all(-1)
+
+
+def _across(problem: ReachAvoidProblem, absorbing: AbsorbingSet, x: Tensor, u: Tensor) -> list[Move]:
+    """The rates across each level of each part of a set at controls u (N, m), from the states x (N, n)."""
+    levels, parts = absorbing.levels, absorbing.parts
+    here, count = levels(x), starts_of_a_part(STARTS, len(parts))
+    lowest = torch.stack([x[here[:, part].amax(-1).argsort()[:count]] for part in parts])
+    deep, rates = descended_parts(levels, parts, lowest, problem.states), []
+    for part, starts, ends in zip(parts, lowest, deep, strict=True):
+        # The levels at all states are known: a union may have hundreds of parts, which need not compute them again.
+        known = SearchedPart(lambda x, part=part: levels(x)[..., part], here[:, part], starts, ends)
+        rates += _across_part(problem, known, x, u)
+    return [Move(f"the {absorbing.name}", speed, spread) for speed, spread in rates]
+
+
+def _across_part(problem: ReachAvoidProblem, part: SearchedPart, x: Tensor, u: Tensor) -> list[tuple[float, float]]:
+    """The speed and the spread, in depths, across each constraint of a part of a set.
+
+    They are taken at those of the states x (N, n) that lie in the part, and half way between its face and the ends of
+    the descents. Where the physics has no number inside the part, they are those of states beside it.
+    """
+    inside, deep = (part.here <= 0).all(-1), part.contains(part.ends)
+    found = torch.cat([part.here[inside], part.constraints(part.ends[deep])])
     if not len(found):
         return []
     depths = (-found).amax(0).tolist()
-    entering = holds(deep) & ~holds(lowest)
-    face = bisected(holds, deep[entering], lowest[entering])
-    rates = _speeds(problem, constraints, torch.cat([x[inside], (face + deep[entering]) / 2]), u)
+    entering = deep & ~part.contains(part.starts)
+    face = bisected(part.contains, part.ends[entering], part.starts[entering])
+    rates = _speeds(problem, part.constraints, torch.cat([x[inside], (face + part.ends[entering]) / 2]), u)
     if rates.isnan().any() and not inside.all():
-        beside = x[~inside][here[~inside].amax(-1).argsort()[:STARTS]]
-        rates = torch.where(rates.isnan(), _speeds(problem, constraints, beside, u), rates)
+        beside = x[~inside][part.here[~inside].amax(-1).argsort()[:STARTS]]
+        rates = torch.where(rates.isnan(), _speeds(problem, part.constraints, beside, u), rates)
     pairs = zip(depths, *rates.tolist(), strict=True)
-    return [Move(name, v / depth, s / depth) for depth, v, s in pairs if depth > 0]
+    return [(v / depth, s / depth) for depth, v, s in pairs if depth > 0]
 
 
 def _speeds(problem: ReachAvoidProblem, constraints: Callable[[Tensor], Tensor], x: Tensor, u: Tensor) -> Tensor:

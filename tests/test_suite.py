@@ -154,6 +154,11 @@ def test_the_command_goes_on_where_it_stopped(tmp_path, capsys, monkeypatch):
     again = json.loads((tmp_path / "runs/suite/exit1d/3/score-50-40.json").read_text())
     assert again["mse"] == first["mse"]
     assert again["gap_noise"] < first["gap_noise"]
+    main([*SMALL, "seeds=[3]", "draw=1"])
+    elsewhere = json.loads((tmp_path / "runs/suite/exit1d/3/score-50-draw1-20.json").read_text())
+    assert elsewhere["seconds"] == first["seconds"], "a run is measured at other states without being trained again"
+    draws = [torch.load(tmp_path / f"runs/suite/exit1d/truth-50{end}.pt")["x"] for end in ("", "-draw1")]
+    assert not any(torch.isin(*draws))
     with pytest.raises(SystemExit):
         main([*SMALL, "seeds=[3]", "trainer.updates=30"])
     assert re.search(r"out: expected a new directory.*trainer\.updates=30", capsys.readouterr().err)
@@ -189,6 +194,7 @@ def test_the_table_and_the_figure_have_all_runs_of_the_folder(tmp_path, capsys, 
         (["problems=[exit1d]", "against=[mpc]"], "against: expected names out of grid, lqr, ppo, sac, got 'mpc'"),
         (["problems=[exit1d]", "patience=0"], "patience: expected a number > 0, got 0"),
         (["problems=[exit1d]", "rollouts=0"], "rollouts: expected integers >= 1, got 0"),
+        (["problems=[exit1d]", "draw=-1"], "draw: expected integers >= 0, got -1"),
         (["problems=[exit1d]", "trainer.update=3"], "update"),
     ],
 )
@@ -229,7 +235,10 @@ def test_a_figure_has_times_of_problems_that_come_in_several_dimensions():
     gap, times = figure.axes[2:]
     assert times.lines[0].get_xdata().tolist() == [2, 8]
     assert list(times.lines[0].get_ydata()) == [52.0, 58.0]
+    assert times.get_ylim()[1] > 60
     assert [0.009, 0.009] in [list(line.get_xdata()) for line in gap.lines]
+    alone = {f"{family}-2": [asdict(score)] for family in ("halfspace", "radial_exit")}
+    assert len(draw_suite(alone).axes) == 3, "times of one number of states"
 
 
 def test_files_in_the_place_of_a_run_stay(tmp_path, capsys):

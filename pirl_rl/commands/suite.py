@@ -4,11 +4,13 @@
 
 Trains each problem with each seed, measures the runs against the truth, and prints one table. What is done already in
 the folder `out` is not repeated, so that a suite that was stopped goes on. The table and the figure have all runs of
-the folder that were measured with as many states and rollouts, so that several commands can fill one folder.
+the folder that were measured at the same states with as many rollouts, so that several commands can fill one folder.
 
     problems   names of problems; all by default
     seeds      seeds of the trainings, [0] by default
     states     the number of states at which a run is measured, 400 by default
+    draw       the number of the draw of these states, 0 by default; a choice that was made at the states of one draw is
+               reported at those of another
     rollouts   the number of paths from each of them, 1,000 by default
     against    alternatives that are measured at the same states, out of grid, lqr, ppo and sac; none by default.
                The grid is timed until its error is that of the worst run. The others give a policy; ppo and sac are
@@ -58,6 +60,7 @@ DEFAULTS: dict[str, Any] = {
     "problems": [*PROBLEMS],
     "seeds": [0],
     "states": 400,
+    "draw": 0,
     "rollouts": 1_000,
     "against": [],
     "patience": 10.0,
@@ -67,7 +70,7 @@ DEFAULTS: dict[str, Any] = {
 ALTERNATIVES = ("grid", *RIVALS)
 
 STATES_SEED = 30_000
-"""The seed of the states at which runs are measured; neither trainings nor the choice of the recipe use it."""
+"""The seed of the first draw of the states at which runs are measured. Trainings never use it."""
 
 
 @program
@@ -76,11 +79,11 @@ def main(arguments: Sequence[str]) -> None:
         options, overrides = _options(arguments)
         folder, others = Path(options["out"]), {}
         for name in options["problems"]:
-            truth = _truth(folder / name, name, overrides, options["states"])
+            truth = _truth(folder / name, name, overrides, options)
             typed = [*PROBLEMS[name], *overrides]
             trust = named_modules(typed, compose("train", typed).trust)
             own = [
-                _score(folder / name / str(seed), name, [*overrides, f"seed={seed}"], truth, options["rollouts"], trust)
+                _score(folder / name / str(seed), name, [*overrides, f"seed={seed}"], truth, options, trust)
                 for seed in options["seeds"]
             ]
             others[name] = {
@@ -114,19 +117,16 @@ def _options(arguments: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
             raise ConfigError(f"{name}: expected names out of {', '.join(known)}, got {unknown[0]!r}")
     if not isinstance(options["patience"], (int, float)) or not options["patience"] > 0:
         raise ConfigError(f"patience: expected a number > 0, got {options['patience']!r}")
-    for name, entries in (
-        ("seeds", options["seeds"]),
-        ("states", [options["states"]]),
-        ("rollouts", [options["rollouts"]]),
-    ):
-        if not all(isinstance(entry, int) and entry >= (name != "seeds") for entry in entries):
-            raise ConfigError(f"{name}: expected integers >= {int(name != 'seeds')}, got {options[name]!r}")
+    for name, least in (("seeds", 0), ("draw", 0), ("states", 1), ("rollouts", 1)):
+        entries = options[name] if name == "seeds" else [options[name]]
+        if not all(isinstance(entry, int) and entry >= least for entry in entries):
+            raise ConfigError(f"{name}: expected integers >= {least}, got {options[name]!r}")
     return options, [text for text in arguments if text not in own]
 
 
-def _truth(folder: Path, name: str, overrides: Sequence[str], states: int) -> Truth:
+def _truth(folder: Path, name: str, overrides: Sequence[str], options: dict[str, Any]) -> Truth:
     """The truth of a problem, from its file in the folder if it is there."""
-    path = _truth_file(folder, states)
+    path, states = _truth_file(folder, options), options["states"]
     changes = sorted(text for text in overrides if text.lstrip("+").startswith("env.problem"))
     if path.is_file():
         truth, known = _read_truth(path)
@@ -138,7 +138,7 @@ def _truth(folder: Path, name: str, overrides: Sequence[str], states: int) -> Tr
         return truth
     problem = make_problem(compose("train", [*PROBLEMS[name], *overrides]))
     print(f"{name}: the truth at {states} states", flush=True)
-    truth = find_truth(problem, states, STATES_SEED)
+    truth = find_truth(problem, states, STATES_SEED + options["draw"])
     folder.mkdir(parents=True, exist_ok=True)
     with replacing(path, binary=True) as file:
         torch.save(asdict(truth) | {"changes": changes}, file)
@@ -152,20 +152,25 @@ def _read_truth(path: Path) -> tuple[Truth, list[str]]:
     return Truth(**entries), changes
 
 
-def _truth_file(folder: Path, states: int) -> Path:
+def _states(options: dict[str, Any]) -> str:
+    """The states at which runs are measured, as a part of the names of files."""
+    return f"{options['states']}-draw{options['draw']}" if options["draw"] else str(options["states"])
+
+
+def _truth_file(folder: Path, options: dict[str, Any]) -> Path:
     """The file with the truth of a problem."""
-    return folder / f"truth-{states}.pt"
+    return folder / f"truth-{_states(options)}.pt"
 
 
 def _measured(folder: Path, options: dict[str, Any]) -> tuple[dict[str, list[Score]], dict[str, str]]:
     """The scores of all runs in the folder, and where the truth of each problem comes from, by problem."""
     scores, sources = {}, {}
     for name in PROBLEMS:
-        known = _truth_file(folder / name, options["states"])
+        known = _truth_file(folder / name, options)
         if not known.is_file():
             continue
         truth, _ = _read_truth(known)
-        file = _score_file(truth, options["rollouts"])
+        file = _score_file(options)
         runs = [run for run in (folder / name).iterdir() if run.name.isdecimal() and (run / file).is_file()]
         seeds = sorted(int(run.name) for run in runs)
         paths = [folder / name / str(seed) / file for seed in seeds]
@@ -175,19 +180,19 @@ def _measured(folder: Path, options: dict[str, Any]) -> tuple[dict[str, list[Sco
     return scores, sources
 
 
-def _score_file(truth: Truth, rollouts: int) -> str:
+def _score_file(options: dict[str, Any]) -> str:
     """The name of the file with the score of a run."""
-    return f"score-{len(truth.x)}-{rollouts}.json"
+    return f"score-{_states(options)}-{options['rollouts']}.json"
 
 
 def _score(
-    folder: Path, name: str, overrides: Sequence[str], truth: Truth, rollouts: int, trust: Sequence[str]
+    folder: Path, name: str, overrides: Sequence[str], truth: Truth, options: dict[str, Any], trust: Sequence[str]
 ) -> Score:
     """The score of a run in the folder, which is trained and measured first, as far as that is not done.
 
     It imports modules that the settings of this command trust, whatever the run's own configuration says.
     """
-    path, run = folder / _score_file(truth, rollouts), RunDirectory(folder)
+    path, run = folder / _score_file(options), RunDirectory(folder)
     typed = [*PROBLEMS[name], *overrides]
     refuse_other_settings(run, typed, "out")
     if path.is_file():
@@ -201,9 +206,8 @@ def _score(
                 train_new(compose("train", typed), folder, typed)
     summary = json.loads(run.summary.read_text(encoding="utf-8"))
     trained = load_run(folder, trust=trust)
-    score = measure(
-        trained.solution, trained.simulator, truth, rollouts, summary["wall_seconds"], int(summary.get("updates", 0))
-    )
+    seconds, updates = summary["wall_seconds"], int(summary.get("updates", 0))
+    score = measure(trained.solution, trained.simulator, truth, options["rollouts"], seconds, updates)
     with replacing(path) as file:
         file.write(json.dumps(asdict(score), indent=2) + "\n")
     return score
@@ -216,7 +220,7 @@ def _alternative(
 
     The grid is timed anew, because its goal is the error of the worst run, which changes with the seeds.
     """
-    path = folder / f"{other}-{len(truth.x)}-{options['rollouts']}-{options['patience']:g}.json"
+    path = folder / f"{other}-{_states(options)}-{options['rollouts']}-{options['patience']:g}.json"
     if path.is_file() and other != "grid":
         found = json.loads(path.read_text(encoding="utf-8"))
         return None if found is None else Alternative(**found)

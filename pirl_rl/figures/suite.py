@@ -26,7 +26,8 @@ FAMILY = re.compile(r"(\w+)-(\d+)")
 def draw_suite(scores: Mapping[str, Sequence[Mapping[str, float]]]) -> Figure:
     """Dots for all seeds of each problem, with the standard error of the loss and the noise in the distance.
 
-    The last panel has the time of training of problems that come in several dimensions; without any it is left out.
+    The last panel has the time of training of problems that come in several dimensions. It is left out where the scores
+    have one number of states.
 
     Args:
         scores: the entries of the scores of all seeds, by the name of the problem.
@@ -62,13 +63,13 @@ def _draw_problems(panel: Axes, values: Mapping[str, Sequence[float]]) -> None:
 
 
 def _times(scores: Mapping[str, Sequence[Mapping[str, float]]]) -> dict[str, dict[int, float]]:
-    """The shortest time of training, in s, by family and number of states."""
+    """The shortest time of training, in s, by family and number of states; nothing where there is one number."""
     families: dict[str, dict[int, float]] = {}
     for name, runs in scores.items():
         if found := FAMILY.fullmatch(name):
             # Other processes on the machine only lengthen a time.
             families.setdefault(found[1], {})[int(found[2])] = min(run["seconds"] for run in runs)
-    return families
+    return families if len({n for times in families.values() for n in times}) > 1 else {}
 
 
 def _draw_times(panel: Axes, families: Mapping[str, Mapping[int, float]]) -> None:
@@ -78,7 +79,7 @@ def _draw_times(panel: Axes, families: Mapping[str, Mapping[int, float]]) -> Non
     panel.set_xscale("log")
     panel.set_xticks(numbers, list(map(str, numbers)))
     panel.minorticks_off()
-    panel.set_ylim(bottom=0)
+    panel.set_ylim(0, 1.1 * max(max(times.values()) for times in families.values()))
     panel.legend()
     panel.set(xlabel="number of states n", ylabel="time of training, fastest seed (s)")
     panel.grid(alpha=0.3)
