@@ -232,7 +232,8 @@ def test_a_figure_of_problems_without_a_truth():
 def test_a_figure_has_times_of_problems_that_come_in_several_dimensions():
     score = Score(1e-4, 0.01, 0.1, 0.5, 0.002, 0.001, 0.02, 0.01, 0.009, 60.0, 12_000)
     figure = draw_suite({f"halfspace-{n}": [asdict(score), asdict(score) | {"seconds": 50.0 + n}] for n in (2, 8)})
-    gap, times = figure.axes[2:]
+    mse, _, gap, times = figure.axes
+    assert mse.get_xlim() == pytest.approx((1e-5, 1e-3)), "whole decades, the margin beside 1e-4 among them"
     assert times.lines[0].get_xdata().tolist() == [2, 8]
     assert list(times.lines[0].get_ydata()) == [52.0, 58.0]
     assert times.get_ylim()[1] > 60

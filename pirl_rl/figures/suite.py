@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 PANELS = {
     "mse": "mean square error of V",
@@ -48,7 +50,7 @@ def draw_suite(scores: Mapping[str, Sequence[Mapping[str, float]]]) -> Figure:
     for panel in (loss, gap):
         panel.locator_params(axis="x", nbins=4)
     if any(run["mse"] > 0 for runs in scores.values() for run in runs):
-        mse.set_xscale("log")
+        _scale_by_decades(mse)
     if families:
         _draw_times(panels[-1], families)
     return figure
@@ -60,6 +62,14 @@ def _draw_problems(panel: Axes, values: Mapping[str, Sequence[float]]) -> None:
     panel.set_yticks(range(len(values)), list(values))
     panel.set_ylim(len(values) - 0.5, -0.5)  # the same in all panels, also where a problem has no truth
     panel.grid(alpha=0.3)
+
+
+def _scale_by_decades(panel: Axes) -> None:
+    """A logarithmic axis of whole decades, whose labels do not overlap where the values lie close together."""
+    panel.set_xscale("log")
+    low, high = math.log10(panel.dataLim.minposx / 1.1), math.log10(panel.dataLim.x1 * 1.1)
+    panel.set_xlim(10.0 ** math.floor(low), 10.0 ** math.ceil(high))
+    panel.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _times(scores: Mapping[str, Sequence[Mapping[str, float]]]) -> dict[str, dict[int, float]]:
