@@ -8,7 +8,8 @@
 
 Each benchmark runs in a process of its own with one thread. One that needs a package or a device that is not there is
 left out with a sentence. The results are written after each benchmark, so that an interrupted run leaves what it has
-measured. A ratio that has become worse gets a warning, and the exit status stays 0.
+measured. A ratio that has become worse gets a warning, and the exit status stays 0. Where a benchmark fails, the others
+run, the exit status is 1, and nothing is stored.
 """
 
 from __future__ import annotations
@@ -65,6 +66,10 @@ NEEDS = {"peers": ("stable_baselines3", "gymnasium"), "deployment": ("onnx", "on
 """The modules that a benchmark needs beside those of the package, by name."""
 
 
+class Failure(str):
+    """A sentence that says how a benchmark failed."""
+
+
 def run(commands: Mapping[str, str]) -> Iterator[tuple[str, dict[str, Any] | str]]:
     """Run benchmarks one after the other, which print their tables.
 
@@ -90,10 +95,11 @@ def run(commands: Mapping[str, str]) -> Iterator[tuple[str, dict[str, Any] | str
             line = [sys.executable, str(FOLDER / file), *arguments, "--json", str(result)]
             status = subprocess.run(line, env=environment, check=False).returncode
             done = status == 0 and result.is_file()
-            yield name, json.loads(result.read_text()) if done else f"The benchmark failed with exit status {status}."
+            failure = Failure(f"The benchmark failed with exit status {status}.")
+            yield name, json.loads(result.read_text()) if done else failure
 
 
-def collect(commands: Mapping[str, str], path: Path) -> dict[str, float]:
+def collect(commands: Mapping[str, str], path: Path) -> tuple[dict[str, float], list[str]]:
     """Run benchmarks, and write what they find to one file after each of them.
 
     Args:
@@ -101,7 +107,7 @@ def collect(commands: Mapping[str, str], path: Path) -> dict[str, float]:
         path: the file of all results.
 
     Returns:
-        The ratios of all benchmarks, by name.
+        The ratios of all benchmarks, by name, and the names of benchmarks that failed.
     """
     found: dict[str, Any] = {}
     skipped: dict[str, str] = {}
@@ -115,7 +121,7 @@ def collect(commands: Mapping[str, str], path: Path) -> dict[str, float]:
             del record["machine"]  # it stands once for all
             found[name] = record
         save(path, ratios, skipped=skipped, benchmarks=found)
-    return ratios
+    return ratios, [name for name, reason in skipped.items() if isinstance(reason, Failure)]
 
 
 def main(stored: Path = STORED) -> None:
@@ -129,14 +135,16 @@ def main(stored: Path = STORED) -> None:
     parser.add_argument("--json", type=Path, default=Path("runs/benchmarks.json"))
     parser.add_argument("--store", action="store_true")
     arguments = parser.parse_args()
-    ratios, earlier = collect(SHORT if arguments.short else ALL, arguments.json), read(stored)
+    (ratios, failed), earlier = collect(SHORT if arguments.short else ALL, arguments.json), read(stored)
     print(f"\n## ratios, of which larger ones are better\n\n{table(ratios, earlier['ratios'])}\n")
-    if arguments.store:
-        save(stored, ratios)
-    else:
+    if not arguments.store:
         print("\n".join(compare(ratios, earlier["ratios"])))
         print(f"The stored ratios are those of {earlier['machine'].get('processor', 'no machine yet')}.")
     print(f"written  {arguments.json}")
+    if failed:
+        sys.exit(f"error: benchmarks that failed: {', '.join(failed)}")
+    if arguments.store:
+        save(stored, ratios)
 
 
 if __name__ == "__main__":

@@ -141,7 +141,7 @@ class Variant:
         wrap: Callable = compilation.compiled if compiled else lambda function: function
         if nested:
             hjb = self.loss.hjb
-            self.loss.hjb = NestedResidual(hjb.problem, hjb.noise, hjb.noise_clip, hjb.delta, hjb.probes)
+            self.loss.hjb = NestedResidual(hjb.problem, hjb.noise, hjb.noise_clip, hjb.time, hjb.delta, hjb.probes)
             if compiled:
                 self.loss.hjb.residuals = torch.compiler.disable(self.loss.hjb.residuals)  # type: ignore[method-assign]
         self.critic_loss = wrap(with_gradient(self.loss.critic_loss, self.loss.qvalue_network_params))

@@ -82,6 +82,21 @@ def test_peers_compares_networks_of_the_widths_that_it_names(experiment):
         assert [layer.out_features for layer in dense[:-1]] == [*widths]
 
 
+def test_nested_autograd_computes_the_same_residual():
+    """Both variants of the benchmark have equal networks and points, so that their HJB losses and gradients agree."""
+    from benchmarks import learner
+
+    variants = [learner.Variant(learner.SHAPES[1], nested=nested, compiled=False) for nested in (True, False)]
+    losses, _, gradients = zip(*(each.hjb_loss(each.batch["collocation"]) for each in variants), strict=True)
+    assert isinstance(variants[0].loss.hjb, learner.NestedResidual)
+    assert losses[0].item() == pytest.approx(losses[1].item(), rel=1e-4)
+    for nested, own in zip(*gradients, strict=True):
+        if own is None:  # the last bias, which no derivative of V depends on
+            assert nested is None
+            continue
+        torch.testing.assert_close(nested, own, rtol=1e-3, atol=1e-4 * own.abs().max().item())
+
+
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
     """A folder with one benchmark, from which the command takes its files."""
@@ -120,12 +135,14 @@ def test_it_prints_tables_stores_ratios_and_warns_of_worse_ones(folder, monkeypa
 
 def test_benchmarks_that_cannot_run_are_left_out_with_a_sentence(folder, monkeypatch, capfd):
     monkeypatch.setitem(command.NEEDS, "extra", ("json", "no_such_module"))
-    run(folder, monkeypatch, extra="fake.py 1.0", broken="fake.py nonsense", fake="fake.py 2.0")
+    with pytest.raises(SystemExit, match="error: benchmarks that failed: broken"):
+        run(folder, monkeypatch, "--store", extra="fake.py 1.0", broken="fake.py nonsense", fake="fake.py 2.0")
     printed = capfd.readouterr().out
     assert "skipped: The benchmark needs no_such_module, which this Python does not have." in printed
     assert "skipped: The benchmark failed with exit status 1." in printed
     assert "| fake: theirs / ours | 2.00 |" in printed
     assert json.loads((folder / "results.json").read_text())["skipped"].keys() == {"extra", "broken"}
+    assert not (folder / "stored.json").exists(), "what failed would have no ratio there"
 
 
 # Time to accuracy
