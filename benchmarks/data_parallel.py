@@ -51,9 +51,9 @@ def average(gradient: Gradient) -> Gradient:
 def share_gradients(trainer: Trainer) -> None:
     """Let the optimisers of a trainer step along the mean gradient of all processes."""
     learner = trainer.learner
-    critics, actor = learner.step_critics, learner.step_actor
-    learner.step_critics = lambda found, k: critics(average(found), k)  # type: ignore[method-assign]
-    learner.step_actor = lambda found, k: actor(average(found), k)  # type: ignore[method-assign]
+    critics, actor = learner.lead_critics, learner.lead_actor
+    learner.lead_critics = lambda found, k: critics(average(found), k)  # type: ignore[method-assign]
+    learner.lead_actor = lambda found, k: actor(average(found), k)  # type: ignore[method-assign]
 
 
 def train(rank: int, processes: int, port: int, settings: list[str], threads: int, updates: int, result: Any) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from small import small_trainer
 from torch import Tensor
 
 from benchmarks import __main__ as command
@@ -17,6 +18,7 @@ from benchmarks.kinds.other_constants import CONSTANTS, OTHERS, drawn
 from benchmarks.ratios import WORSE, compare, table
 from pirl_rl import Box
 from pirl_rl.evaluation.monte_carlo import monte_carlo
+from pirl_rl.gradients import Gradient
 from pirl_rl.grid import GridSolver
 from pirl_rl.layers import Dense
 from pirl_rl.problems import DubinsCar
@@ -95,6 +97,24 @@ def test_nested_autograd_computes_the_same_residual():
             assert nested is None
             continue
         torch.testing.assert_close(nested, own, rtol=1e-3, atol=1e-4 * own.abs().max().item())
+
+
+def test_processes_that_share_a_batch_step_along_the_mean_gradient(tmp_path, monkeypatch):
+    """With gradients that are averaged to 0, the networks stay as they are."""
+    from benchmarks import data_parallel
+
+    def vanishing(gradient: Gradient) -> Gradient:
+        return gradient[0], gradient[1], tuple(None if entry is None else 0 * entry for entry in gradient[2])
+
+    monkeypatch.setattr(data_parallel, "average", vanishing)
+    trainer = small_trainer(tmp_path)
+    before = trainer.learner.loss.state_dict()
+    before = {name: entry.clone() for name, entry in before.items() if "_params." in name and "target" not in name}
+    data_parallel.share_gradients(trainer)
+    trainer.train()
+    after = trainer.learner.loss.state_dict()
+    assert before
+    assert all(torch.equal(entry, after[name]) for name, entry in before.items())
 
 
 @pytest.fixture
