@@ -141,8 +141,9 @@ def _across(problem: ReachAvoidProblem, absorbing: AbsorbingSet, x: Tensor, u: T
 def _across_part(problem: ReachAvoidProblem, part: SearchedPart, x: Tensor, u: Tensor) -> list[tuple[float, float]]:
     """The speed and the spread, in depths, across each constraint of a part of a set.
 
-    They are taken with the controls u (M, m), at those of the states x (N, n) that lie in the part, and half way between
-    its face and the ends of the descents. Where the physics has no number inside the part, they are those of states beside it.
+    They are taken with the controls u (M, m), at those of the states x (N, n) that lie in the part, and half way
+    between its face and the ends of the descents. Where the physics has no number inside the part, they are those of
+    states beside it.
     """
     inside, deep = (part.here <= 0).all(-1), part.contains(part.ends)
     found = torch.cat([part.here[inside], part.constraints(part.ends[deep])])
