@@ -112,6 +112,23 @@ def improved(
     return torch.where((objective(together) >= alone).unsqueeze(-1), together, single), stakes.mT
 
 
+def best_bounds(objective: Objective, action: Tensor) -> tuple[Tensor, Tensor]:
+    """The better of the two bounds of each coordinate while the others stand still, and how much it is better.
+
+    Args:
+        objective: the function to maximise, for actions (*, N, m), which is nearly affine in each coordinate.
+        action: the action (N, m) at which the other coordinates stand still.
+
+    Returns:
+        The action (N, m) with all those bounds, and the range of the objective between the bounds of each coordinate
+        (N, m), 0 where the objective has no number.
+    """
+    own = torch.eye(action.shape[-1], dtype=torch.bool, device=action.device)[:, None, None]
+    bounds = torch.tensor([-1.0, 1.0], dtype=action.dtype, device=action.device)[:, None, None]
+    low, high = objective(torch.where(own, bounds, action)).movedim(1, 0).mT  # (N, m) each
+    return torch.where(high > low, 1.0, -1.0).to(action), (high - low).abs().nan_to_num(0.0, 0.0, 0.0)
+
+
 def _preferred(values: Tensor, before: Tensor, options: Tensor, parts: Tensor, inertia: float) -> tuple[Tensor, Tensor]:
     """The best option of each group after inertia (groups, N), and the range of the values (groups, N).
 

@@ -15,7 +15,7 @@ from pirl_rl.problems import RadialExit, Reach1D, Safety1D, VehicleDrift, Zermel
 from pirl_rl.problems.drift.starts import EquilibriumStates
 from pirl_rl.sampling.faces import NearFaces
 from pirl_rl.sampling.initial_states import UniformStates, VisitedStates, sample_interior
-from pirl_rl.sampling.undecided import UndecidedStates
+from pirl_rl.sampling.undecided import MOST_CHANNELS, UndecidedStates
 from pirl_rl.sampling.wider import FARTHEST, WiderStates
 from pirl_rl.sets import Box
 from pirl_rl.simulator import Simulator
@@ -192,11 +192,15 @@ def test_states_near_faces_are_outside_both_sets(problem):
         (lambda: WiderStates(UniformStates(), Simulator(Reach1D()), 1.5), "0 <= share <= 1, got 1.5"),
         (
             lambda: UndecidedStates(UniformStates(), Known(), Simulator(Reach1D()), 0.0),
-            "0 < floor <= 1 and candidates >= 1, got 0.0 and 4",
+            "0 < floor <= 1, candidates >= 1 and gain >= 0, got 0.0, 4 and 0.0",
         ),
         (
             lambda: UndecidedStates(UniformStates(), Known(), Simulator(Reach1D()), 0.2, 0),
-            "candidates >= 1, got 0.2 and 0",
+            "candidates >= 1 and gain >= 0, got 0.2, 0 and 0.0",
+        ),
+        (
+            lambda: UndecidedStates(UniformStates(), Known(), Simulator(Reach1D()), gain=math.nan),
+            "gain >= 0, got 0.2, 4 and nan",
         ),
     ],
 )
@@ -301,6 +305,9 @@ class Known:
     def value(self, tau, x):
         return torch.where((x[:, 0] > 0) & (tau > 0.5), 0.5, 1.0)
 
+    def residual(self, tau, x):
+        raise AssertionError("no residual is asked for without a gain")
+
 
 def test_undecided_states_come_by_their_weights():
     """A quarter of the candidates has the weight 1, the others 0.25: with many candidates 4 of 7 are undecided.
@@ -317,12 +324,42 @@ def test_undecided_states_come_by_their_weights():
     assert undecided.double().mean().item() == pytest.approx(4 / 7, abs=0.01 + 4 * (12 / 49 / count) ** 0.5)
 
 
+class Wrong(Known):
+    """V = 1, with a residual of -0.4 1/s where x > 0, of 1,000 1/s where x < -1/2, and of 0 between."""
+
+    def value(self, tau, x):
+        return torch.ones_like(tau)
+
+    def residual(self, tau, x):
+        return torch.where(x[:, 0] > 0, -0.4, torch.where(x[:, 0] < -0.5, 1e3, 0.0))
+
+
+def test_states_at_which_the_equation_does_not_hold_come_more_often():
+    """With T = 2 s and the gain 1/2 the weights are 1/4 + 0.4, 1/4 + 1, where the largest residual counts, and 1/4."""
+    problem, count = Stream(2.0), 2_000
+    others = UniformStates([-1.0, -1.0], [1.0, 1.0])
+    law = UndecidedStates(others, Wrong(), Simulator(problem, 0.05), floor=0.25, candidates=50, gain=0.5)
+    x = law.sample(problem, count, 40, torch.Generator().manual_seed(0), torch.float64)[1][:, 0]
+    shares = [(x > 0).double().mean().item(), (x < -0.5).double().mean().item()]
+    total = 2 * 0.65 + 1.25 + 0.25
+    assert shares == pytest.approx([2 * 0.65 / total, 1.25 / total], abs=0.015 + 4 * (0.25 / count) ** 0.5)
+
+
+def test_with_many_noise_channels_the_residual_is_left_out():
+    """`Wrong` would draw half of the states with the weight 1.25 or more."""
+    problem = RadialExit(dim=MOST_CHANNELS + 1)
+    law = UndecidedStates(UniformStates(), Wrong(), Simulator(problem, 0.05), gain=0.5)
+    assert torch.equal(draw(problem, law)[1], draw(problem, UndecidedStates(UniformStates(), Wrong(), Simulator(problem, 0.05)))[1])
+
+
 def test_networks_that_have_diverged_give_equal_weights():
     class Diverged:
         def value(self, tau, x):
             return torch.full_like(tau, math.nan)
 
-    _, x = draw(Safety1D(), UndecidedStates(UniformStates(), Diverged(), Simulator(Safety1D())))
+        residual = value
+
+    _, x = draw(Safety1D(), UndecidedStates(UniformStates(), Diverged(), Simulator(Safety1D()), gain=1.0))
     assert Safety1D().interior(x).all()
 
 

@@ -33,6 +33,9 @@ def test_each_training_has_the_value_of_its_networks(base, tmp_path):
         expected = [one.solution.value(t, y) for one, t, y in zip(members, tau.chunk(3), x.chunk(3), strict=True)]
         torch.testing.assert_close(joint.value(tau, x), torch.cat(expected), rtol=1e-4, atol=1e-5)
         assert not torch.allclose(expected[0], expected[1], atol=1e-3)
+        expected = [one.solution.residual(t, y) for one, t, y in zip(members, tau.chunk(3), x.chunk(3), strict=True)]
+        found, scale = joint.residual(tau, x), torch.cat(expected).abs().max().item()
+        torch.testing.assert_close(found, torch.cat(expected), rtol=1e-4, atol=1e-5 * scale)
 
 
 class Halves:
@@ -66,6 +69,7 @@ def test_states_are_in_the_order_of_the_trainings(drawn, monkeypatch, tmp_path):
     states._enter()
     assert states._together is not None
     monkeypatch.setattr(joint_states.JointValue, "value", lambda self, tau, x: _by_training(x))
+    monkeypatch.setattr(joint_states.JointValue, "residual", lambda self, tau, x: torch.zeros_like(tau))
     problem, rng = envs[0].problem, torch.Generator().manual_seed(0)
     steps, x = states.sample(problem, 3 * 1_000, envs[0].max_steps, rng, torch.float32)
     assert (steps.shape, x.shape) == ((3_000,), (3_000, 1))

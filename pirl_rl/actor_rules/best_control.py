@@ -11,14 +11,15 @@ from torch import Tensor
 
 from pirl_rl.action_values import Face, Flow, absorbing_faces, expected_ahead, free_step, hamiltonian, value_ahead
 from pirl_rl.actor_rules.base import ActorRule
-from pirl_rl.ascent import Objective, improved
+from pirl_rl.ascent import Objective, best_bounds, improved
 from pirl_rl.errors import ArgumentError
+from pirl_rl.holding import held_value
 from pirl_rl.networks import Critic
 from pirl_rl.operators import masked_mean
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
-from pirl_rl.structure import controlled_channels, noise_channels
+from pirl_rl.structure import controlled_channels, is_control_affine, noise_channels
 from pirl_rl.switching import FINE_LEVELS, LEVELS, control_levels
 
 INERTIA = 0.1
@@ -40,6 +41,12 @@ All of them count for the budget.
 
 MOST_PAIRS = 64
 """The largest number of noise channels times controls for which the noise of a step is simulated."""
+
+MOST_HELD = 3
+"""The largest number m of controls for which V is evaluated after holding each of their bounds, at 2m states."""
+
+HELD_COST = 8
+"""What a point with a held control costs of the budget, times m + 1: V and its gradient there, and V at 2m states."""
 
 
 class BestControl(ActorRule):
@@ -64,6 +71,11 @@ class BestControl(ActorRule):
     Coordinates on which the same channels depend take their best levels at once, one block of them after the other.
     With more noise channels times controls than `MOST_PAIRS` the step would be too dear, and the Hamiltonian stays.
 
+    Where the drift is affine in u, sigma does not depend on u, and there are at most `MOST_HELD` controls, the larger
+    of V after holding a control and of its tangent takes the place of the Hamiltonian, see
+    `pirl_rl.holding.held_value`. It differs from the Hamiltonian where V bends upwards, as between two ways that are
+    equally good.
+
     The Hamiltonian is the limit of a control that is never held. Where a control step is long, as with fewer than a
     hundred of them in the horizon, V after `steps` noise-free control steps takes its place, divided by dt: the first
     step with the candidate, the others with the policy, the rollout algorithm of D. Bertsekas (Rollout, Policy
@@ -83,7 +95,7 @@ class BestControl(ActorRule):
             the actor does not cost more with more controls. Where candidates are simulated, it is the largest number of
             simulated states. Each level of each control at each point then needs `steps` of them for a look ahead, and
             w/2 for a cubature with the noise of w channels: each of its 2w ends counts as a quarter, since it needs V
-            alone.
+            alone. Where controls are held, each point needs `HELD_COST` times m + 1.
         inertia: what a level loses for each unit of its distance from the actor's output when levels are compared, as a
             share of the range of the Hamiltonian between the two, >= 0; see `pirl_rl.ascent.improved`. Where noise
             grows with |u|, both bounds are good beside a convex obstacle, and the worst control lies between them.
@@ -108,13 +120,15 @@ class BestControl(ActorRule):
         budget: int = 8_192,
         inertia: float | None = None,
         ahead: float = 0.01,
+        hold: float = 0.02,
     ):
         if levels is None:
             levels = max(LEVELS if steps else 2, control_levels(problem))
-        if steps < 0 or levels < 2 or budget < 1 or (inertia is not None and inertia < 0) or not ahead >= 0:
+        negative = steps < 0 or (inertia is not None and inertia < 0) or not ahead >= 0 or not hold >= 0
+        if negative or levels < 2 or budget < 1:
             raise ArgumentError(
-                "actor_rule: expected steps >= 0, levels >= 2, budget >= 1, inertia >= 0 and ahead >= 0, "
-                f"got {steps}, {levels}, {budget}, {inertia} and {ahead}"
+                "actor_rule: expected steps >= 0, levels >= 2, budget >= 1, inertia >= 0, ahead >= 0 and hold >= 0, "
+                f"got {steps}, {levels}, {budget}, {inertia}, {ahead} and {hold}"
             )
         self.simulator, self.steps, self.levels, self.inertia = simulator, steps, levels, inertia
         self.controlled_noise, self.compiles_whole = simulator.controlled_noise, steps == 0
@@ -122,22 +136,28 @@ class BestControl(ActorRule):
         self.cubature = steps == 0 and self.controlled_noise and noise_channels(problem) * m <= MOST_PAIRS
         self.channels = controlled_channels(problem) if self.cubature else [[]] * m
         self.flow: Flow = simulator.flow
+        affine = levels == 2 and not self.controlled_noise and is_control_affine(problem)
+        self.held = hold * problem.horizon if affine and steps == 0 and m <= MOST_HELD else 0.0
 
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
         actor, choice = solution.actor, solution.actor.choice
         like = points["state"]
+        held = self.held if choice is None else 0.0
         if choice:
             levels = choice.combinations(like)
         else:
             levels = torch.linspace(-1, 1, self.levels, dtype=like.dtype, device=like.device).unsqueeze(-1)
-        most = self.most_points(levels)
+        most = self.most_points(levels, bool(held))
         tau, x = points["tau"][:most], points["state"][:most]
         logits = actor.logits(tau, x)
         with torch.no_grad():
             action = actor.layers[-1](logits)
             usual = CHOICE_INERTIA if choice and not self.controlled_noise else INERTIA
             inertia = usual if self.inertia is None else self.inertia
-            best, weight = self._improved(solution, tau.squeeze(-1), x, action, levels, inertia)
+            if held:
+                best, weight = best_bounds(held_value(solution, tau.squeeze(-1), x, held), action)
+            else:
+                best, weight = self._improved(solution, tau.squeeze(-1), x, action, levels, inertia)
         if choice:
             scores = choice.grouped(logits).movedim(-1, 1)
             entropy = torch.nn.functional.cross_entropy(scores, choice.indices(best), reduction="none")
@@ -156,8 +176,15 @@ class BestControl(ActorRule):
             found.setdefault(tuple(sorted(channels)), []).append(group)
         return found
 
-    def most_points(self, levels: Tensor) -> int:
-        """The largest number of points that the budget allows, for levels (k, s) of groups of s coordinates."""
+    def most_points(self, levels: Tensor, holds: bool = False) -> int:
+        """The largest number of points that the budget allows.
+
+        Args:
+            levels: the levels (k, s) of groups of s coordinates.
+            holds: whether controls are held.
+        """
+        if holds:
+            return max(1, self.budget // (HELD_COST * (len(self.channels) + 1)))
         count, size = levels.shape
         blocks = self.blocks(size).items()
         cost = sum(len(groups) * max(1, count * (self.steps or len(channels) / 2)) for channels, groups in blocks)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -48,7 +48,7 @@ class StackedNetworks:
 
 
 class JointValue:
-    """V of several trainings: state number i N + j of M N states has V of training i.
+    """V of several trainings and its residual: state number i N + j of M N states has those of training i.
 
     Args:
         solutions: the solutions of one problem.
@@ -58,7 +58,8 @@ class JointValue:
         self.members = len(solutions)
         self._networks = StackedNetworks([[one.actor, one.critic] for one in solutions])
         self._solution = Solution(solutions[0].problem, *self._networks.twins)  # type: ignore[arg-type]
-        self._every = torch.func.vmap(self._of_member)
+        self._values = torch.func.vmap(self._lent(self._solution.raw_value))
+        self._residuals = torch.func.vmap(self._lent(self._solution.residual))
 
     def gather(self) -> None:
         """Take over the networks as they stand."""
@@ -66,13 +67,25 @@ class JointValue:
 
     def value(self, tau: Tensor, x: Tensor) -> Tensor:
         """V (M N,) in [0, 1] at times to go tau (M N,), in s, and states x (M N, n), see `Solution.value`."""
-        own = (entry.unflatten(0, (self.members, -1)) for entry in (tau, x))
-        return self._solution.corrected(self._every(self._networks.params, *own).flatten(), x)
+        return self._solution.corrected(self._of_members(self._values, tau, x), x)
 
-    def _of_member(self, params: Sequence[TensorDictBase], tau: Tensor, x: Tensor) -> Tensor:
-        kept, (actor, critic) = {"preserve_module_state": False}, self._networks.twins
-        with params[0].to_module(actor, **kept), params[1].to_module(critic, **kept):
-            return self._solution.raw_value(tau, x)
+    def residual(self, tau: Tensor, x: Tensor) -> Tensor:
+        """The HJB residual (M N,), in 1/s, under the policies of the trainings, see `Solution.residual`."""
+        return self._of_members(self._residuals, tau, x)
+
+    def _of_members(self, function: Callable[..., Tensor], tau: Tensor, x: Tensor) -> Tensor:
+        own = (entry.unflatten(0, (self.members, -1)) for entry in (tau, x))
+        return function(self._networks.params, *own).flatten()
+
+    def _lent(self, function: Callable[[Tensor, Tensor], Tensor]) -> Callable[..., Tensor]:
+        """A function of the networks as a function of their parameters, too."""
+
+        def of_member(params: Sequence[TensorDictBase], tau: Tensor, x: Tensor) -> Tensor:
+            kept, (actor, critic) = {"preserve_module_state": False}, self._networks.twins
+            with params[0].to_module(actor, **kept), params[1].to_module(critic, **kept):
+                return function(tau, x)
+
+        return of_member
 
 
 class JointStates:

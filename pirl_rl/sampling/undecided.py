@@ -1,4 +1,4 @@
-"""Initial states where success is neither certain nor impossible."""
+"""Initial states where success is neither certain nor impossible, and where V does not solve its equation."""
 
 from __future__ import annotations
 
@@ -11,22 +11,39 @@ from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.initial_states import InitialStates
 from pirl_rl.simulator import Simulator
+from pirl_rl.structure import noise_channels
+
+LARGEST = 2.0
+"""The largest residual that counts, in units of V over the horizon: layers at faces have residuals of any size."""
+
+
+MOST_CHANNELS = 16
+"""The largest number of noise channels with which the residual, which has a column for each, is computed."""
 
 
 class HasValue(Protocol):
-    """Something that knows V, such as a `pirl_rl.solution.Solution`."""
+    """Something that knows V and its policy, such as a `pirl_rl.solution.Solution`."""
 
     def value(self, tau: Tensor, x: Tensor) -> Tensor:
         """V (N,) in [0, 1] at times to go tau (N,), in s, and states x (N, n)."""
         ...
 
+    def residual(self, tau: Tensor, x: Tensor) -> Tensor:
+        """The HJB residual of V under its policy (N,), in 1/s, at times to go tau (N,), in s, and states x (N, n)."""
+        ...
+
 
 class UndecidedStates:
-    """States of another distribution, more often where V is neither near 0 nor near 1.
+    """States of another distribution, more often where V is neither near 0 nor near 1, and where it is wrong.
 
     In many dimensions most of a box is lost or safe whatever the control is, and a path from there teaches little. Of
     `candidates` times as many states as are needed, each is therefore drawn, without replacement, with a weight of
-    floor + (1 - floor) 4 V (1 - V), where V is that of the networks as they stand, at the time to go of its episode.
+    floor + (1 - floor) 4 V (1 - V) + gain min(T |L^pi V|, 2), where V and its HJB residual, Eq. (parabolic_operator),
+    are those of the networks as they stand, at the time to go of the episode, and T is the horizon.
+
+    The residual shows where the networks are wrong, before any outcome does. A state may be rare in the box and matter
+    all the same, as between two ways past an obstacle that are equally good. Points of a physics-informed network are
+    drawn in the same way (C. Wu et al., Computer Methods in Applied Mechanics and Engineering 403, 2023).
 
     Copies for other processes lose the networks, which would be out of date there, and take the states as they come.
 
@@ -36,6 +53,7 @@ class UndecidedStates:
         simulator: its clock turns control steps to go into times to go.
         floor: the weight of a state at which V is 0 or 1, where a state at which V = 1/2 has the weight 1; in (0, 1].
         candidates: the number of candidates for each state, >= 1.
+        gain: the factor of the residual, >= 0; 0 leaves it out, and so do more than `MOST_CHANNELS` columns of sigma.
 
     Attributes:
         groups: the states are in the order (groups, *), and each group is drawn from its own candidates; 1 except for
@@ -52,13 +70,15 @@ class UndecidedStates:
         simulator: Simulator,
         floor: float = 0.2,
         candidates: int = 4,
+        gain: float = 0.0,
     ):
-        if not 0 < floor <= 1 or candidates < 1:
+        if not 0 < floor <= 1 or candidates < 1 or not gain >= 0:
             raise ArgumentError(
-                f"initial_states: expected 0 < floor <= 1 and candidates >= 1, got {floor} and {candidates}"
+                "initial_states: expected 0 < floor <= 1, candidates >= 1 and gain >= 0, "
+                f"got {floor}, {candidates} and {gain}"
             )
         self.others, self.solution, self.clock = others, solution, simulator.clock
-        self.floor, self.candidates, self.groups = floor, candidates, 1
+        self.floor, self.candidates, self.gain, self.groups = floor, candidates, gain, 1
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"solution": None}
@@ -75,9 +95,13 @@ class UndecidedStates:
         if self.solution is None:
             return self.others.sample(problem, count, max_steps, rng, dtype, visited)
         steps, x = self.others.sample(problem, self.candidates * count, max_steps, rng, dtype, visited)
+        tau = self.clock.time(steps).to(x)
         # The trainer reports networks that have diverged.
-        v = self.solution.value(self.clock.time(steps).to(x), x).nan_to_num(0.5).clamp(0, 1)
+        v = self.solution.value(tau, x).nan_to_num(0.5).clamp(0, 1)
         weight = self.floor + (1 - self.floor) * 4 * v * (1 - v)
+        if self.gain and noise_channels(problem) <= MOST_CHANNELS:
+            residual = problem.horizon * self.solution.residual(tau, x).abs()
+            weight = weight + self.gain * residual.nan_to_num(0.0).clamp(max=LARGEST)
         chosen = torch.multinomial(weight.reshape(self.groups, -1), count // self.groups, generator=rng)
         rows = torch.arange(self.groups, device=x.device).unsqueeze(-1) * (len(x) // self.groups)
         chosen = (chosen + rows).flatten()
