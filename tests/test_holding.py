@@ -45,7 +45,8 @@ class Known:
         self.problem, self.bend, self.actor = problem, bend, Actor(problem)
 
     def value(self, tau: Tensor, x: Tensor) -> Tensor:
-        assert tau.ndim == 1 and x.ndim == 2
+        assert tau.ndim == 1
+        assert x.ndim == 2
         return (0.5 + self.bend(x[..., 0]) + 0.02 * tau).masked_fill(self.problem.failed(x), 0.0)
 
     def gradient(self, tau: Tensor, x: Tensor) -> Tensor:
@@ -145,7 +146,7 @@ def test_the_bounds_that_are_taken_maximise_an_affine_objective():
 
 
 def test_the_rule_turns_the_actor_to_the_better_way():
-    """The gradient of its loss in the output before the tanh is that towards +1, with the weight of the held control."""
+    """The gradient of its loss in the output before the tanh leads to +1, with the weight of the held control."""
     problem = Turn()
     solution = Known(problem, valley)
     last = solution.actor.layers[-2]
@@ -171,5 +172,5 @@ def test_points_with_held_controls_are_fewer():
 
 
 def test_a_time_below_zero_is_refused():
-    with pytest.raises(ArgumentError, match="hold >= 0, got 0, 2, 8192, None, 0.01 and -1"):
+    with pytest.raises(ArgumentError, match=r"hold >= 0, got 0, 2, 8192, None, 0\.01 and -1"):
         BestControl(Turn(), Simulator(Turn(), 0.05), hold=-1)

@@ -348,8 +348,9 @@ def test_states_at_which_the_equation_does_not_hold_come_more_often():
 def test_with_many_noise_channels_the_residual_is_left_out():
     """`Wrong` would draw half of the states with the weight 1.25 or more."""
     problem = RadialExit(dim=MOST_CHANNELS + 1)
-    law = UndecidedStates(UniformStates(), Wrong(), Simulator(problem, 0.05), gain=0.5)
-    assert torch.equal(draw(problem, law)[1], draw(problem, UndecidedStates(UniformStates(), Wrong(), Simulator(problem, 0.05)))[1])
+    simulator = Simulator(problem, 0.05)
+    plain, weighted = (UndecidedStates(UniformStates(), Wrong(), simulator, gain=gain) for gain in (0.0, 0.5))
+    assert torch.equal(draw(problem, weighted)[1], draw(problem, plain)[1])
 
 
 def test_networks_that_have_diverged_give_equal_weights():
