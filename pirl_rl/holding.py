@@ -19,6 +19,13 @@ from pirl_rl.solution import Solution
 PIECES = 2
 """The number of steps, by the midpoint rule, in which a control is held."""
 
+LONGEST = 8
+"""The largest number of control steps for which a control is held.
+
+A control step is at most half as long as a set is thick. A path is looked at in the middle and at the end of each
+piece, so that it moves for two control steps between two looks, and does not pass a thin wall unseen.
+"""
+
 
 def held_value(solution: Solution, tau: Tensor, x: Tensor, length: float) -> Objective:
     """The larger of V after holding a control and of its tangent (*, N), in 1/s, Eq. (held_value).
@@ -48,7 +55,9 @@ def held_value(solution: Solution, tau: Tensor, x: Tensor, length: float) -> Obj
         tangent = (drift * slope).sum(-1)
         for piece in range(PIECES):
             drift = problem.drift(y, u) if piece else drift
+            middle = problem.states.wrap(y + drift * (h / 2))
             moved = problem.states.wrap(y + midpoint_drift(problem, y, u, drift, h) * h)
+            moved = torch.where(problem.interior(middle).unsqueeze(-1), moved, middle)
             y = torch.where(problem.interior(y).unsqueeze(-1), moved, y)
         # Networks take one axis of points.
         ahead = solution.value(later.expand(y.shape[:-1]).flatten(), y.flatten(0, -2)).reshape(y.shape[:-1])

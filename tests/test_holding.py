@@ -106,6 +106,22 @@ def test_a_held_control_stops_in_a_set():
     assert back == pytest.approx(0.1 * (0.9**2 - 1.3**2) / 0.2, rel=1e-4)
 
 
+def test_a_held_control_does_not_pass_a_thin_wall():
+    """From x = 1.3 the first half of the path ends at 1.7, past the wall, and has its middle in it."""
+    solution = Known(Turn(), lambda x: 0.01 * x.square())
+    x, tau = torch.tensor([[1.3]]), torch.ones(1)
+    through = held_value(solution, tau, x, 0.4)(torch.ones(1, 1)).item()
+    assert through == pytest.approx(2 * 0.02 * 1.3)  # the tangent, which is above -V/h
+    assert through < 0.01 * (2.1**2 - 1.3**2) / 0.4  # what the way through the wall would be worth
+
+
+def test_a_control_is_held_for_eight_control_steps_at_most():
+    problem = Turn()
+    assert BestControl(problem, Simulator(problem, 0.0125)).held == pytest.approx(0.1)
+    assert BestControl(problem, Simulator(problem, 0.003125)).held == pytest.approx(0.025)
+    assert BestControl(problem, Simulator(problem, 0.003125), steps=1).held == 0
+
+
 def test_a_held_control_follows_a_period():
     """From x = -1.9 a path of -0.4 ends at 1.7, where a valley with its bottom at 1.7 is lowest."""
     solution = Known(Turn(), lambda x: 0.1 * (x - 1.7).square())
