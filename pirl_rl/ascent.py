@@ -124,7 +124,7 @@ def best_bounds(objective: Objective, action: Tensor) -> tuple[Tensor, Tensor]:
         (N, m), 0 where the objective has no number.
     """
     own = torch.eye(action.shape[-1], dtype=torch.bool, device=action.device)[:, None, None]
-    bounds = torch.tensor([-1.0, 1.0], dtype=action.dtype, device=action.device)[:, None, None]
+    bounds = torch.linspace(-1, 1, 2, dtype=action.dtype, device=action.device)[:, None, None]
     low, high = objective(torch.where(own, bounds, action)).movedim(1, 0).mT  # (N, m) each
     return torch.where(high > low, 1.0, -1.0).to(action), (high - low).abs().nan_to_num(0.0, 0.0, 0.0)
 

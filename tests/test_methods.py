@@ -153,7 +153,7 @@ def test_every_constructor_argument_is_a_key(overrides):
     for key, node in found.items():
         # The collector's laws of starts end with that of the environment, which stands there.
         # An experiment replaces the actor rule, whose arguments therefore stand nowhere.
-        actor_rule = {"steps", "levels", "budget", "inertia", "ahead"}
+        actor_rule = {"steps", "levels", "budget", "inertia", "ahead", "hold"}
         supplied = {"collector.initial_states.others.others": {"others"}, "loss.actor_rule": actor_rule}.get(key, set())
         assert {*node} | supplied >= {*arguments(node._target_)}, key
 
