@@ -2,7 +2,7 @@
 
 Before a wall a car must turn to one side or to the other, and V is the larger of the values of the two ways. Where they
 are equal V has a kink, which a network rounds off: its gradient points to either side only at some distance from the
-bottom of the valley. If the bottom lies in the wrong place, the Hamiltonian keeps it there. The states beside it take
+bottom of the valley. If the bottom lies in the wrong place, the Hamiltonian hardly moves it. The states beside it take
 the worse way, V learns what that way is worth, and the Hamiltonian agrees. A control that is held for a while leads out
 of the valley, to where V is known better.
 """
