@@ -6,8 +6,9 @@
 docs/suite.md says which of the problems had a part in choices, and in which. V and the success of the learned policy
 are compared with the grid, in the way of the suite, at 400 states, which `--states` draws. There is no truth with
 three states and two controls, or with more states. Bearing and Mirror are exceptions: they are compared with the
-products of the grids of their independent subsystems. A run takes minutes. A finished run is loaded and not trained
-again, so that other settings need another folder.
+products of the grids of their independent subsystems. A run takes minutes. What is done already in the folder is not
+repeated: neither a training, so that other settings need another folder, nor a measurement at the same states with as
+many rollouts.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import yaml
 import pirl_rl
 from benchmarks.kinds import PROBLEMS, Mixture
 from benchmarks.record import save
+from pirl_rl.files import replacing
 from pirl_rl.grid import GridSolver
 from pirl_rl.sampling.initial_states import sample_interior
 from pirl_rl.scoring import Score, Truth, find_truth, markdown, measure
@@ -51,6 +53,9 @@ def measured(name: str, arguments: argparse.Namespace, settings: dict) -> Score:
     """Train a problem, or load its finished run, and compare it with the grid."""
     problem, seed = PROBLEMS[name](), arguments.seed
     folder = arguments.out / f"{name}-{seed}"
+    known = folder / f"score-{arguments.states}-{arguments.rollouts}.json"
+    if known.is_file():
+        return Score(**json.loads(known.read_text(encoding="utf-8")))
     if isinstance(problem, Mixture):
         truth = truth_by_parts(problem, arguments.states)
     else:
@@ -60,7 +65,10 @@ def measured(name: str, arguments: argparse.Namespace, settings: dict) -> Score:
     run = pirl_rl.load_run(folder, problem=problem)
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     seconds, updates = summary["wall_seconds"], int(summary["updates"])
-    return measure(run.solution, run.simulator, truth, arguments.rollouts, seconds, updates)
+    score = measure(run.solution, run.simulator, truth, arguments.rollouts, seconds, updates)
+    with replacing(known) as file:
+        file.write(json.dumps(asdict(score), indent=2) + "\n")
+    return score
 
 
 def main() -> None:
@@ -81,7 +89,6 @@ def main() -> None:
     asked = {key: getattr(arguments, key) for key in ("seed", "states", "rollouts")}
     save(arguments.json, {}, **asked, settings=settings, problems=found)
     print(markdown({name: [score] for name, score in scores.items()}, dict.fromkeys(scores, "grid")))
-    print(f"\nThe standard error of each loss is at most {max(score.loss_error for score in scores.values()):.4f}.")
 
 
 if __name__ == "__main__":

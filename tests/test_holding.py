@@ -183,7 +183,7 @@ def test_points_with_held_controls_are_fewer():
     problem = Turn()
     levels = torch.tensor([[-1.0], [1.0]])
     rule = BestControl(problem, Simulator(problem, 0.05), budget=10 * 16 + 15)
-    assert rule.most_points(levels, holds=True) == 10
+    assert rule.most_held() == 10
     assert rule.most_points(levels) == 175
 
 

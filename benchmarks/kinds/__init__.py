@@ -16,6 +16,7 @@ from benchmarks.kinds.plants import Epidemic, Investor, Reactor, Reservoir, Togg
 from benchmarks.kinds.stores import Chemostat, FastCharge, Ferment, Fishery, Forager
 from benchmarks.kinds.swings import Duffing, MountainCar, QuietStance, Swingup
 from benchmarks.kinds.vehicles import Bicycle, Evader, Loiter, Ring, River, Slalom, Steering, TwoCars, TwoHarbours
+from benchmarks.kinds.waters import Convection, Drawbridge, Fjord, Levee
 from pirl_rl import ReachAvoidProblem
 
 __all__ = ["KINDS", "PROBLEMS", "Mixture"]
@@ -28,5 +29,6 @@ KINDS += (LotkaVolterra, Chain, Unicycle, Rendezvous, FastRiver, Glider, Reactor
 KINDS += (VaccineStock, Backburn, ChemoWard, IslandGrid, StraitFerry, QuietStance, LynxAndHare, HerdImmunity)
 KINDS += (TackingYacht, Encounter, Descent, Gantry, Endowment, Granary, PairTrade, Chemostat)
 KINDS += (SolarCar, Scooter, Barge, Tightrope, Casino, Washboard, Uphill, Gene)
+KINDS += (Fjord, Drawbridge, Levee, Convection)
 
 PROBLEMS = {kind.__name__: kind for kind in KINDS} | OTHERS

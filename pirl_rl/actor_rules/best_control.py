@@ -150,16 +150,16 @@ class BestControl(ActorRule):
             levels = choice.combinations(like)
         else:
             levels = torch.linspace(-1, 1, self.levels, dtype=like.dtype, device=like.device).unsqueeze(-1)
-        most = self.most_points(levels, bool(held))
+        most = self.most_held() if held else self.most_points(levels)
         tau, x = points["tau"][:most], points["state"][:most]
         logits = actor.logits(tau, x)
         with torch.no_grad():
             action = actor.layers[-1](logits)
-            usual = CHOICE_INERTIA if choice and not self.controlled_noise else INERTIA
-            inertia = usual if self.inertia is None else self.inertia
             if held:
                 best, weight = best_bounds(held_value(solution, tau.squeeze(-1), x, held), action)
             else:
+                usual = CHOICE_INERTIA if choice and not self.controlled_noise else INERTIA
+                inertia = usual if self.inertia is None else self.inertia
                 best, weight = self._improved(solution, tau.squeeze(-1), x, action, levels, inertia)
         if choice:
             scores = choice.grouped(logits).movedim(-1, 1)
@@ -179,15 +179,12 @@ class BestControl(ActorRule):
             found.setdefault(tuple(sorted(channels)), []).append(group)
         return found
 
-    def most_points(self, levels: Tensor, holds: bool = False) -> int:
-        """The largest number of points that the budget allows.
+    def most_held(self) -> int:
+        """The largest number of points that the budget allows where controls are held."""
+        return max(1, self.budget // (HELD_COST * (len(self.channels) + 1)))
 
-        Args:
-            levels: the levels (k, s) of groups of s coordinates.
-            holds: whether controls are held.
-        """
-        if holds:
-            return max(1, self.budget // (HELD_COST * (len(self.channels) + 1)))
+    def most_points(self, levels: Tensor) -> int:
+        """The largest number of points that the budget allows, for levels (k, s) of groups of s coordinates."""
         count, size = levels.shape
         blocks = self.blocks(size).items()
         cost = sum(len(groups) * max(1, count * (self.steps or len(channels) / 2)) for channels, groups in blocks)

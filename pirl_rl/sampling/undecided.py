@@ -16,7 +16,6 @@ from pirl_rl.structure import noise_channels
 LARGEST = 2.0
 """The largest residual that counts, in units of V over the horizon: layers at faces have residuals of any size."""
 
-
 MOST_CHANNELS = 16
 """The largest number of noise channels with which the residual, which has a column for each, is computed."""
 

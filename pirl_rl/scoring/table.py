@@ -29,6 +29,8 @@ def markdown(
 ) -> str:
     """The table in Markdown; each entry is the mean over the seeds, with the worst of them in parentheses.
 
+    The loss of success has its standard error, where there is one seed.
+
     Args:
         scores: the scores of all seeds, by the name of the problem.
         sources: where the truth of each problem comes from, likewise.
@@ -64,12 +66,15 @@ def _measured(runs: Sequence[Score]) -> list[str]:
         mean = format(sum(values) / len(values), form)
         return mean if len(values) == 1 else f"{mean} ({format(worst(values), form)})"
 
+    loss = entry([run.loss for run in runs], ".4f")
+    if len(runs) == 1 and loss:
+        loss += f" ± {runs[0].loss_error:.4f}"
     return [
         str(len(runs)),
         entry([run.mse for run in runs], ".1e"),
         entry([run.largest_error for run in runs], ".2f"),
         entry([run.success for run in runs], ".3f", min),
-        entry([run.loss for run in runs], ".4f"),
+        loss,
         entry([run.largest_loss for run in runs], ".3f"),
         entry([run.gap for run in runs], ".4f"),
         entry([run.gap_noise for run in runs], ".4f"),
