@@ -85,7 +85,8 @@ def train(
             checkpoint. `settings` change it for good.
         **settings: an argument of the trainer (`updates=200`), a key of the configuration (`seed=3`, `compile=False`),
             a choice of a group (`method="td3"`, `logger="none"`), a nested mapping (`schedule={"center": 1e3}`) or a
-            key with dots (`**{"schedule.center": 1e3}`).
+            key with dots (`**{"schedule.center": 1e3}`). As on the command line, a plus sign in front adds an argument
+            that the configuration leaves at its default (`**{"+pirl.actor_rule.hold": 0.0}`).
 
     Returns:
         The run, opened from its directory, or the runs of all members of a population.

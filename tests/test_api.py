@@ -223,6 +223,13 @@ def test_a_class_takes_its_arguments_from_the_settings(tmp_path):
         pirl_rl.train(Windy, folder=tmp_path / "other", **few, **{"env.problem.wnd": 1.0})
 
 
+@pytest.mark.parametrize("value", [0.0, {"a": [1, "b c"]}], ids=str)
+def test_a_plus_sign_adds_an_argument_as_on_the_command_line(value):
+    config, typed = compose_run("reach1d", {"+pirl.actor_rule.hold": value})
+    assert config.pirl.actor_rule.hold == value
+    assert typed[-1].startswith("+pirl.actor_rule.hold=")
+
+
 @pytest.mark.parametrize("settings", [{"env.problem.horizon": 1.0}, {"env": {"problem": {"horizon": 1.0}}}], ids=str)
 def test_arguments_of_an_object_are_refused_with_what_to_do(settings, tmp_path):
     message = r"env\.problem.*: expected no arguments of the problem, which is an object of Reach1D.*give them to "
@@ -238,6 +245,13 @@ def test_arguments_of_an_object_are_refused_with_what_to_do(settings, tmp_path):
         ({"schedule.centre": 3}, r"schedule\.centre: expected one of .*center"),
         ({"schedule": {"centre": 3}}, r"schedule\.centre: expected one of .*center"),
         ({"seed": {"a": 1}}, r"seed\.a: expected one of no more names"),
+        (
+            {"pirl.actor_rule.hold": 0.0},
+            r"expected one of _target_; '\+pirl\.actor_rule\.hold' adds an argument to pirl",
+        ),
+        ({"+pirl.actor_rule.hodl": 0.0}, r"hodl: BestControl has no such argument; expected one of .*hold"),
+        ({"+seed": 1}, r"Could not append to config\. An item is already at 'seed'"),
+        ({"+nothing.here": 1}, r"\+nothing\.here: expected one of .*method"),
         ({"method": "nope"}, "nope"),
         ({"updates": "many"}, "trainer.updates: expected int, got 'many'"),
         ({"updates": slice(3)}, "trainer.updates: expected a number, text"),

@@ -67,8 +67,9 @@ def typed_settings(
     """Translate settings to overrides `key=value`.
 
     Args:
-        settings: values by keys with dots, or nested mappings.
-        config: the configuration, which must have each key unless a new `_target_` is set beside it.
+        settings: values by keys with dots, or nested mappings. A key with a plus sign in front, as of an argument that
+            the configuration leaves at its default, is added.
+        config: the configuration, which must have each other key unless a new `_target_` is set beside it.
         short: the node whose entries may be named without its name, such as "trainer".
         groups: names of groups, which the error message lists too.
 
@@ -78,7 +79,7 @@ def typed_settings(
     texts = []
     renewed = tuple(name.removesuffix("_target_") for name in settings if name.endswith("._target_"))
     for name, value in settings.items():
-        first = name.partition(".")[0]
+        first = name.removeprefix("+").partition(".")[0]
         if first in config.keys():
             key = name
         elif first in config[short].keys():
@@ -93,8 +94,11 @@ def typed_settings(
 def _texts(key: str, value: Any, config: DictConfig, renewed: tuple[str, ...]) -> list[str]:
     """The override of a setting or, for a mapping, those of its entries.
 
-    Keys that begin with one of `renewed`, the nodes with a new `_target_`, need not be in `config`.
+    Keys need not be in `config` if they begin with a plus sign, or with one of `renewed`, the nodes with a new
+    `_target_`.
     """
+    if key.startswith("+"):
+        return [f"{key}={_literal(value, key)}"]
     if isinstance(value, Mapping):
         renewed = (*renewed, f"{key}.") if "_target_" in value else renewed
         return [text for name, entry in value.items() for text in _texts(f"{key}.{name}", entry, config, renewed)]
@@ -114,6 +118,8 @@ def _check_key(key: str, config: DictConfig) -> None:
     for count, part in enumerate(parts := key.split("."), 1):
         if not isinstance(node, DictConfig) or part not in node.keys():  # `in node` is False for a missing value
             known = ", ".join(str(name) for name in node) if isinstance(node, DictConfig) else "no more names"
+            if isinstance(node, DictConfig) and "_target_" in node:
+                known += f"; '+{key}' adds an argument to {node._target_}"
             raise ConfigError(f"{'.'.join(parts[:count])}: expected one of {known}")
         node = node._get_node(part)
 
