@@ -14,7 +14,7 @@ from benchmarks.kinds import Bicycle, Crosswind, Duffing, Gusty, Loiter, Swingup
 from pirl_rl import Box, ReachAvoidProblem
 from pirl_rl.errors import ArgumentError
 from pirl_rl.evaluation.monte_carlo import monte_carlo
-from pirl_rl.grid import GridSolution, GridSolver
+from pirl_rl.grid import GridSolution, GridSolver, march
 from pirl_rl.grid.candidates import candidates
 from pirl_rl.grid.mesh import default_margin, make_mesh, widest_margin
 from pirl_rl.passages import first_passage
@@ -935,3 +935,36 @@ def test_a_wider_margin_leaves_a_mesh_as_it_is_where_all_beyond_it_is_in_a_set(p
     assert len({mesh.shape for mesh in meshes}) == 1
     nodes = [mesh.states(mesh.indices()) for mesh in meshes]
     assert all(np.array_equal(other, nodes[0]) for other in nodes)
+
+
+@pytest.fixture(scope="module")
+def half_space_in_three_dimensions() -> GridSolution:
+    return GridSolver(HalfSpace(dim=3), 9, estimate=False).solve()
+
+
+def test_an_iteration_that_breaks_down_at_its_solution_has_solved_the_step(half_space_in_three_dimensions, monkeypatch):
+    """Where the residual vanishes the method divides 0 by 0, and reports a failure."""
+    bicgstab = march.bicgstab
+    monkeypatch.setattr(march, "bicgstab", lambda *args, **options: (bicgstab(*args, **options)[0], -10))
+    solution = GridSolver(HalfSpace(dim=3), 9, estimate=False).solve()
+    assert np.array_equal(solution.field.values, half_space_in_three_dimensions.field.values)
+
+
+def test_a_step_in_three_dimensions_that_the_iteration_cannot_solve_is_taken_in_two(
+    half_space_in_three_dimensions, monkeypatch
+):
+    """The error of V, of which that of the steps is a part, does not grow."""
+    bicgstab, calls = march.bicgstab, []
+
+    def fails_at_whole_steps(matrix, right, guess, **options):
+        calls.append(len(calls) % 3)
+        value, failed = bicgstab(matrix, right, guess, **options)
+        return (np.zeros_like(value), 1000) if calls[-1] == 0 else (value, failed)
+
+    monkeypatch.setattr(march, "bicgstab", fails_at_whole_steps)
+    solution = GridSolver(HalfSpace(dim=3), 9, estimate=False).solve()
+    assert calls == [0, 1, 2] * (len(calls) // 3)
+    tau, x = late_states(HalfSpace(dim=3))
+    exact = HalfSpace(dim=3).exact_value(tau, x)
+    halves, whole = ((grid.value(tau, x) - exact).abs().mean() for grid in (solution, half_space_in_three_dimensions))
+    assert 0 < halves < whole
