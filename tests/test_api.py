@@ -251,6 +251,7 @@ def test_arguments_of_an_object_are_refused_with_what_to_do(settings, tmp_path):
         ),
         ({"+pirl.actor_rule.hodl": 0.0}, r"hodl: BestControl has no such argument; expected one of .*hold"),
         ({"+seed": 1}, r"Could not append to config\. An item is already at 'seed'"),
+        ({"+updates": 1}, r"Could not append to config\. An item is already at 'trainer\.updates'"),
         ({"+nothing.here": 1}, r"\+nothing\.here: expected one of .*method"),
         ({"method": "nope"}, "nope"),
         ({"updates": "many"}, "trainer.updates: expected int, got 'many'"),

@@ -135,6 +135,13 @@ def test_the_table_names_the_worst_seed():
     assert "| 0.450 (0.400) |" in row
 
 
+def test_one_seed_has_the_standard_error_of_its_loss():
+    rest = dict.fromkeys(("mean_error", "largest_error", "largest_loss", "gap", "gap_noise", "seconds"), 0.0)
+    score = Score(mse=1e-4, success=0.5, loss=0.002, loss_error=0.0007, **rest, updates=1)
+    assert "| 0.0020 ± 0.0007 |" in markdown({"p": [score]}, {"p": "exact"})
+    assert "±" not in markdown({"p": [score, score]}, {"p": "exact"})
+
+
 def test_the_command_goes_on_where_it_stopped(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     main([*SMALL, "seeds=[3]"])
