@@ -24,7 +24,6 @@ import yaml
 import pirl_rl
 from benchmarks.kinds import PROBLEMS, Mixture
 from benchmarks.record import save
-from pirl_rl.files import replacing
 from pirl_rl.grid import GridSolver
 from pirl_rl.sampling.initial_states import sample_interior
 from pirl_rl.scoring import Score, Truth, find_truth, markdown, measure
@@ -55,7 +54,7 @@ def measured(name: str, arguments: argparse.Namespace, settings: dict) -> Score:
     folder = arguments.out / f"{name}-{seed}"
     known = folder / f"score-{arguments.states}-{arguments.rollouts}.json"
     if known.is_file():
-        return Score(**json.loads(known.read_text(encoding="utf-8")))
+        return Score.load(known)
     if isinstance(problem, Mixture):
         truth = truth_by_parts(problem, arguments.states)
     else:
@@ -66,8 +65,7 @@ def measured(name: str, arguments: argparse.Namespace, settings: dict) -> Score:
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     seconds, updates = summary["wall_seconds"], int(summary["updates"])
     score = measure(run.solution, run.simulator, truth, arguments.rollouts, seconds, updates)
-    with replacing(known) as file:
-        file.write(json.dumps(asdict(score), indent=2) + "\n")
+    score.save(known)
     return score
 
 

@@ -142,6 +142,15 @@ def test_one_seed_has_the_standard_error_of_its_loss():
     assert "±" not in markdown({"p": [score, score]}, {"p": "exact"})
 
 
+def test_a_score_survives_its_file(tmp_path):
+    """Also the entries without a truth, which are not numbers."""
+    rest = dict.fromkeys(("mse", "mean_error", "largest_error", "loss", "loss_error", "largest_loss"), math.nan)
+    score = Score(success=0.1 + 0.2, **rest, gap=1e-17, gap_noise=0.0, seconds=60.5, updates=7)
+    score.save(tmp_path / "new" / "score.json")
+    again = Score.load(tmp_path / "new" / "score.json")
+    assert repr(again) == repr(score)  # numbers that are not numbers are not equal
+
+
 def test_the_command_goes_on_where_it_stopped(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     main([*SMALL, "seeds=[3]"])

@@ -175,7 +175,7 @@ def _measured(folder: Path, options: dict[str, Any]) -> tuple[dict[str, list[Sco
         seeds = sorted(int(run.name) for run in runs)
         paths = [folder / name / str(seed) / file for seed in seeds]
         if paths:
-            scores[name] = [Score(**json.loads(path.read_text(encoding="utf-8"))) for path in paths]
+            scores[name] = [Score.load(path) for path in paths]
             sources[name] = truth.source
     return scores, sources
 
@@ -196,7 +196,7 @@ def _score(
     typed = [*PROBLEMS[name], *overrides]
     refuse_other_settings(run, typed, "out")
     if path.is_file():
-        return Score(**json.loads(path.read_text(encoding="utf-8")))
+        return Score.load(path)
     if not run.summary.is_file():
         print(f"{name}: {' '.join(overrides)}", flush=True)
         with reported(folder):
@@ -208,8 +208,7 @@ def _score(
     trained = load_run(folder, trust=trust)
     seconds, updates = summary["wall_seconds"], int(summary.get("updates", 0))
     score = measure(trained.solution, trained.simulator, truth, options["rollouts"], seconds, updates)
-    with replacing(path) as file:
-        file.write(json.dumps(asdict(score), indent=2) + "\n")
+    score.save(path)
     return score
 
 

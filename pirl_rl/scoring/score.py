@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import torch
 
 from pirl_rl.arguments import Policy
 from pirl_rl.evaluation.monte_carlo import mean_payoff
+from pirl_rl.files import replacing
 from pirl_rl.scoring.truth import Truth
 from pirl_rl.simulator import Simulator
 from pirl_rl.solution import Solution
@@ -52,6 +55,16 @@ class Score:
     gap_noise: float
     seconds: float
     updates: int
+
+    @classmethod
+    def load(cls, path: Path) -> Score:
+        """The score in a JSON file that `save` wrote."""
+        return cls(**json.loads(path.read_text(encoding="utf-8")))
+
+    def save(self, path: Path) -> None:
+        """Write the score to a JSON file."""
+        with replacing(path) as file:
+            file.write(json.dumps(asdict(self), indent=2) + "\n")
 
 
 def measure(
