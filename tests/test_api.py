@@ -228,6 +228,7 @@ def test_a_plus_sign_adds_an_argument_as_on_the_command_line(value):
     config, typed = compose_run("reach1d", {"+pirl.actor_rule.hold": value})
     assert config.pirl.actor_rule.hold == value
     assert typed[-1].startswith("+pirl.actor_rule.hold=")
+    assert compose_run("reach1d", {"++updates": 7})[0].trainer.updates == 7
 
 
 @pytest.mark.parametrize("settings", [{"env.problem.horizon": 1.0}, {"env": {"problem": {"horizon": 1.0}}}], ids=str)

@@ -79,12 +79,12 @@ def typed_settings(
     texts = []
     renewed = tuple(name.removesuffix("_target_") for name in settings if name.endswith("._target_"))
     for name, value in settings.items():
-        plain = name.removeprefix("+")
-        first, sign = plain.partition(".")[0], name[: len(name) - len(plain)]
+        plain = name.lstrip("+")
+        first, signs = plain.partition(".")[0], name.removesuffix(plain)
         if first in config.keys():
             key = name
         elif first in config[short].keys():
-            key = f"{sign}{short}.{plain}"
+            key = f"{signs}{short}.{plain}"
         else:
             known = sorted({*map(str, config), *(str(key) for key in config[short] if key != "_target_"), *groups})
             raise ConfigError(f"{name}: expected one of {', '.join(known)}")
