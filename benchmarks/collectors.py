@@ -84,7 +84,7 @@ def main() -> None:
     found = measure(settings, arguments.updates, arguments.seconds)
     print(f"| settings | {' | '.join(found)} |\n|---|{'--:|' * len(found)}")
     print(f"| {' '.join(settings)} | {' | '.join(f'{number:,.1f}' for number in found.values())} |")
-    save(arguments.json, {}, settings=settings, **found)
+    save(arguments.json, {}, settings=settings, rates=found)
 
 
 if __name__ == "__main__":

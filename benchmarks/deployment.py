@@ -83,7 +83,7 @@ def compare(model: Model, run: Run) -> dict[str, float]:
     answer = dict(zip(model.outputs, model.session.run(model.outputs, {"tau": tau, "x": x}), strict=True))
     value, gradient, control = run.value(tau, x), run.gradient(tau, x), run.policy(tau, x)
     width = np.subtract(run.problem.controls.high, run.problem.controls.low)
-    masked = np.isin(answer["value"], (0, 1)) != np.isin(value, (0, 1))
+    masked = np.isin(np.asarray(answer["value"]), (0, 1)) != np.isin(value, (0, 1))
     distance = {
         "value": float(np.abs(answer["value"] - value)[~masked].max()),
         "masks": float(masked.sum()),

@@ -163,7 +163,8 @@ def network_inputs(tau: Tensor, x: Tensor) -> Tensor:
 def _stack(weights: Mapping[str, Tensor], prefix: str, activation: nn.Module, output: nn.Module) -> nn.Sequential:
     layers: list[nn.Module] = []
     for name in sorted(name for name in weights if name.startswith(prefix) and name.endswith("weight")):
-        linear = nn.Linear(*weights[name].T.shape)
+        inputs, outputs = weights[name].T.shape
+        linear = nn.Linear(inputs, outputs)
         linear.load_state_dict({"weight": weights[name], "bias": weights[name.replace("weight", "bias")]})
         layers += [linear, activation]
     return nn.Sequential(*layers[:-1], output).requires_grad_(False)

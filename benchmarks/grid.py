@@ -71,7 +71,7 @@ def against_itself(problem: ReachAvoidProblem, points: int, seed: int, rollouts:
     seconds, (tau, x) = time.perf_counter() - started, states(problem, 50, seed)
     played = monte_carlo(problem, solution.policy, tau, x, rollouts=rollouts, dt=problem.horizon / 2_000)
     value = solution.value(tau, x)
-    distance = (value - played.probability).abs()
+    distance = (value - torch.as_tensor(played.probability)).abs()
     # The standard error if V is right: that of Monte Carlo's own estimate is 0 where no path, or every path, succeeds.
     noise = (value * (1 - value) / rollouts).sqrt()
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20

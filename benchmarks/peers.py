@@ -34,6 +34,7 @@ from torchrl.objectives import SoftUpdate, TD3Loss
 from benchmarks.learner import MatrixProducts, Shape
 from benchmarks.record import save
 from pirl_rl.assembly import make_trainer
+from pirl_rl.collectors.sync import SyncCollector
 from pirl_rl.commands.composition import compose
 from pirl_rl.envs import ReachAvoidEnv
 from pirl_rl.gymnasium import ReachAvoidVectorGym
@@ -86,7 +87,7 @@ class Perceptron(nn.Sequential):
         layers: list[nn.Module] = []
         for width, following in itertools.pairwise(widths[:-1]):
             layers += [nn.Linear(width, following), activation()]
-        super().__init__(*layers, nn.Linear(*widths[-2:]), *last)
+        super().__init__(*layers, nn.Linear(widths[-2], widths[-1]), *last)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         return super().forward(torch.cat(inputs, -1))
@@ -127,9 +128,14 @@ def update_torchrl(trainer: Trainer) -> Callable[[int], None]:
     return updates
 
 
-def sb3(trainer: Trainer, paths: int) -> TD3:
-    """TD3 of Stable-Baselines3 on the same problem and simulator."""
-    own = trainer.collector.env
+def collector(trainer: Trainer) -> SyncCollector:
+    assert isinstance(trainer.collector, SyncCollector)
+    return trainer.collector
+
+
+def sb3(trainer: Trainer, paths: int, frequency: int) -> TD3:
+    """TD3 of Stable-Baselines3 on the same problem and simulator, which plays `frequency` steps at a time."""
+    own = collector(trainer).env
     steps = {name: getattr(own.simulator, name) for name in ("dt", "substeps", "crossing")}
     env = ReachAvoidEnv(own.problem, **steps, num_envs=paths, initial_states=own.initial_states, seed=0)
     view = Paths(ReachAvoidVectorGym(env))
@@ -141,15 +147,14 @@ def sb3(trainer: Trainer, paths: int) -> TD3:
         policy_kwargs={"net_arch": {"pi": [*ACTOR], "qf": [*CRITIC]}, "activation_fn": nn.Tanh},
         action_noise=NormalActionNoise(torch.zeros(m).numpy(), 0.2 * torch.ones(m).numpy()),
         learning_starts=0,
-        train_freq=10**9,
+        train_freq=frequency,
         seed=0,
         device="cpu",
     )
 
 
 def update_sb3(trainer: Trainer) -> Callable[[int], None]:
-    model = sb3(trainer, 64)
-    model.train_freq = model.train_freq._replace(frequency=5)
+    model = sb3(trainer, 64, 5)
     model.gradient_steps = 0
     model.learn(6_400)
     return lambda count: model.train(count, BATCH)
@@ -167,16 +172,18 @@ def products(trainer: Trainer) -> Callable[[int], None]:
 
 
 def play_ours(trainer: Trainer) -> Callable[[], int]:
+    own = collector(trainer)
+
     def play() -> int:
-        before = trainer.collector.buffer.write_count
-        trainer.collector._collect()
-        return trainer.collector.buffer.write_count - before
+        before = own.buffer.write_count
+        own._collect()
+        return own.buffer.write_count - before
 
     return play
 
 
 def step_ours(trainer: Trainer) -> Callable[[], int]:
-    env = trainer.collector.env
+    env = collector(trainer).env
     start = env.reset()
     start["action"] = torch.zeros(env.action_spec.shape)
 
@@ -189,8 +196,8 @@ def step_ours(trainer: Trainer) -> Callable[[], int]:
 
 
 def play_sb3(trainer: Trainer, paths: int) -> Callable[[], int]:
-    model = sb3(trainer, paths)
-    model.train_freq, model.gradient_steps = model.train_freq._replace(frequency=100), 0
+    model = sb3(trainer, paths, 100)
+    model.gradient_steps = 0
 
     def play() -> int:
         before = model.num_timesteps

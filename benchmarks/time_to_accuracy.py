@@ -64,7 +64,7 @@ class Clocks:
     """
 
     def __init__(self, started: float):
-        self._zero = dict(zip(CLOCKS, (started, 0.0), strict=True))
+        self._zero: dict[str, float] = dict(zip(CLOCKS, (started, 0.0), strict=True))
 
     def read(self) -> dict[str, float]:
         return {name: value - self._zero[name] for name, value in self._now().items()}
@@ -121,6 +121,7 @@ def train(name: str, settings: list[str], truth: Truth, every: int, started: flo
 
 def error(trainer: Trainer, truth: Truth) -> float:
     """The mean square of V minus the truth."""
+    assert truth.value is not None
     return (trainer.solution.value(truth.tau, truth.x).double() - truth.value).square().mean().item()
 
 

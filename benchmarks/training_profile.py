@@ -22,6 +22,7 @@ import torch
 
 from benchmarks.record import save
 from pirl_rl.assembly import make_trainer
+from pirl_rl.collectors.sync import SyncCollector
 from pirl_rl.commands.composition import compose
 from pirl_rl.commands.console import named_modules
 from pirl_rl.evaluation import evaluate
@@ -67,6 +68,7 @@ class Clock:
 def watch(trainer: Trainer, clock: Clock) -> None:
     """Count the parts of the loop of a trainer."""
     learner, collector = trainer.learner, trainer.collector
+    assert isinstance(collector, SyncCollector)
     clock.watch(collector, "step", "collector: resets, stacking, the rest")
     clock.watch(collector.env.simulator, "step", "collector: simulation")
     clock.watch(collector.env.simulator, "_draw", "collector: random numbers")
