@@ -10,15 +10,17 @@ import torch
 from oracles import PROBLEMS, name
 
 from pirl_rl.errors import ArgumentError, ProblemError
+from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems import RadialExit, Reach1D, Safety1D, VehicleDrift, ZermeloBoat
 from pirl_rl.problems.drift.starts import EquilibriumStates
 from pirl_rl.sampling.faces import NearFaces
 from pirl_rl.sampling.initial_states import UniformStates, VisitedStates, sample_interior
-from pirl_rl.sampling.undecided import MOST_CHANNELS, UndecidedStates
+from pirl_rl.sampling.undecided import FEW_STEPS, MOST_CHANNELS, MOST_COLUMNS, UndecidedStates
 from pirl_rl.sampling.wider import FARTHEST, WiderStates
 from pirl_rl.sets import Box
 from pirl_rl.simulator import Simulator
+from pirl_rl.solution import Solution
 
 COUNT = 20_000
 
@@ -305,7 +307,7 @@ class Known:
     def value(self, tau, x):
         return torch.where((x[:, 0] > 0) & (tau > 0.5), 0.5, 1.0)
 
-    def residual(self, tau, x):
+    def residual(self, tau, x, u, probe):
         raise AssertionError("no residual is asked for without a gain")
 
 
@@ -330,7 +332,7 @@ class Wrong(Known):
     def value(self, tau, x):
         return torch.ones_like(tau)
 
-    def residual(self, tau, x):
+    def residual(self, tau, x, u, probe):
         return torch.where(x[:, 0] > 0, -0.4, torch.where(x[:, 0] < -0.5, 1e3, 0.0))
 
 
@@ -353,9 +355,45 @@ def test_with_many_noise_channels_the_residual_is_left_out():
     assert torch.equal(draw(problem, weighted)[1], draw(problem, plain)[1])
 
 
+@pytest.mark.parametrize("channels", [MOST_COLUMNS, MOST_COLUMNS + 1])
+def test_with_some_noise_channels_the_residual_is_estimated_with_random_signs(channels):
+    class Asked(Known):
+        def residual(self, tau, x, u, probe):
+            probes.append(probe)
+            return torch.zeros_like(tau)
+
+    probes, problem = [], RadialExit(dim=channels)
+    draw(problem, UndecidedStates(UniformStates(), Asked(), Simulator(problem, 0.05), gain=0.5))
+    if channels == MOST_COLUMNS:
+        assert probes == [None]
+    else:
+        assert probes[0].shape[1] == channels
+        assert probes[0].unique().tolist() == [-1.0, 1.0]
+        assert probes[0].mean(0).abs().max() < 5 / len(probes[0]) ** 0.5
+
+
+@pytest.mark.parametrize(("steps", "compiled"), [(FEW_STEPS, True), (FEW_STEPS + 1, False)])
+def test_the_residual_is_compiled_where_episodes_are_short(steps, compiled, monkeypatch):
+    """Rounding moves a weight by a millionth, so that hardly a state changes."""
+    problem = RadialExit(dim=MOST_COLUMNS + 1)
+    torch.manual_seed(0)
+    solution, simulator = (
+        Solution(problem, Actor(problem), stack([Critic(problem)])),
+        Simulator(problem, problem.horizon / steps),
+    )
+    drawn, said = [], []
+    monkeypatch.setattr("pirl_rl.compilation.announce", said.append)
+    for compile in (False, True):
+        law = UndecidedStates(UniformStates(), solution, simulator, gain=2.0, compile=compile)
+        rng = torch.Generator().manual_seed(0)
+        drawn.append(law.sample(problem, 500, steps, rng, torch.float32)[1])
+    assert (drawn[0] == drawn[1]).all(-1).double().mean() > 0.99
+    assert said == ["compiling the residual of V at initial states"] * compiled
+
+
 def test_networks_that_have_diverged_give_equal_weights():
     class Diverged:
-        def value(self, tau, x):
+        def value(self, tau, x, *_):
             return torch.full_like(tau, math.nan)
 
         residual = value

@@ -193,7 +193,9 @@ def describe(m: Measures, reasons: list[Reason]) -> list[str]:
     lines = [f"verdict   {level}: {why}"]
     if len(reasons) > 1:
         lines.append(f"          {' '.join(reason.why for reason in reasons[1:])}")
-    ahead = "" if m.ahead is None else f", one step of look-ahead {m.success + m.ahead.mean:.3f}"
+    ahead = ""
+    if m.ahead is not None:
+        ahead = f", one step of look-ahead {m.success + m.ahead.mean:.3f} ± {m.ahead.error:.3f}"
     lines.append(f"success   {m.success:.3f} of the policy, 95% interval {m.low:.3f} to {m.high:.3f} at these states")
     lines.append(
         f"beside    random controls {m.random:.3f}, the best constant one, {_numbers(m.constant_control)}, "

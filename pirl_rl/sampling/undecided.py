@@ -7,6 +7,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from pirl_rl.compilation import Compiled
 from pirl_rl.errors import ArgumentError
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.initial_states import InitialStates
@@ -16,8 +17,15 @@ from pirl_rl.structure import noise_channels
 LARGEST = 2.0
 """The largest residual that counts, in units of V over the horizon: layers at faces have residuals of any size."""
 
-MOST_CHANNELS = 16
-"""The largest number of noise channels with which the residual, which has a column for each, is computed."""
+MOST_COLUMNS, MOST_CHANNELS = 3, 16
+"""The largest numbers of noise channels with which the residual is exact, which costs a column of derivatives for each
+of them, and with which it is computed at all."""
+
+FEW_STEPS = 100
+"""The largest number of control steps in the horizon with which the residual is compiled, on a CPU.
+
+Then so many episodes end that their starts take a large part of the time. With more steps compilation saves little.
+"""
 
 
 class HasValue(Protocol):
@@ -27,8 +35,8 @@ class HasValue(Protocol):
         """V (N,) in [0, 1] at times to go tau (N,), in s, and states x (N, n)."""
         ...
 
-    def residual(self, tau: Tensor, x: Tensor) -> Tensor:
-        """The HJB residual of V under its policy (N,), in 1/s, at times to go tau (N,), in s, and states x (N, n)."""
+    def residual(self, tau: Tensor, x: Tensor, u: Tensor | None = None, probe: Tensor | None = None) -> Tensor:
+        """The HJB residual (N,), in 1/s, under its policy or u, see `pirl_rl.solution.Solution.residual`."""
         ...
 
 
@@ -42,7 +50,8 @@ class UndecidedStates:
 
     The residual shows where the networks are wrong, before any outcome does. A state may be rare in the box and matter
     all the same, as between two ways past an obstacle that are equally good. Points of a physics-informed network are
-    drawn in the same way (C. Wu et al., Computer Methods in Applied Mechanics and Engineering 403, 2023).
+    drawn in the same way (C. Wu et al., Computer Methods in Applied Mechanics and Engineering 403, 2023). With more
+    than `MOST_COLUMNS` noise channels its trace is estimated with one random vector, see `pirl_rl.operators`.
 
     Copies for other processes lose the networks, which would be out of date there, and take the states as they come.
 
@@ -53,6 +62,7 @@ class UndecidedStates:
         floor: the weight of a state at which V is 0 or 1, where a state at which V = 1/2 has the weight 1; in (0, 1].
         candidates: the number of candidates for each state, >= 1.
         gain: the factor of the residual, >= 0; 0 leaves it out, and so do more than `MOST_CHANNELS` columns of sigma.
+        compile: whether the residual may be compiled, see `FEW_STEPS`.
 
     Attributes:
         groups: the states are in the order (groups, *), and each group is drawn from its own candidates; 1 except for
@@ -70,17 +80,30 @@ class UndecidedStates:
         floor: float = 0.2,
         candidates: int = 4,
         gain: float = 0.0,
+        compile: bool = False,
     ):
         if not 0 < floor <= 1 or candidates < 1 or not gain >= 0:
             raise ArgumentError(
                 "initial_states: expected 0 < floor <= 1, candidates >= 1 and gain >= 0, "
                 f"got {floor}, {candidates} and {gain}"
             )
-        self.others, self.solution, self.clock = others, solution, simulator.clock
-        self.floor, self.candidates, self.gain, self.groups = floor, candidates, gain, 1
+        self.others, self.clock, self.floor, self.candidates, self.gain = (
+            others,
+            simulator.clock,
+            floor,
+            candidates,
+            gain,
+        )
+        self.take_value_of(solution)
+        if compile:
+            self._compiled = Compiled(solution.residual, "the residual of V at initial states")
+
+    def take_value_of(self, solution: HasValue, groups: int = 1) -> None:
+        """Draw each of several groups of states by the V of this solution, whose residual is not compiled."""
+        self.solution, self.groups, self._compiled = solution, groups, None
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"solution": None}
+        return self.__dict__ | {"solution": None, "_compiled": None}
 
     def sample(
         self,
@@ -98,8 +121,14 @@ class UndecidedStates:
         # The trainer reports networks that have diverged.
         v = self.solution.value(tau, x).nan_to_num(0.5).clamp(0, 1)
         weight = self.floor + (1 - self.floor) * 4 * v * (1 - v)
-        if self.gain and noise_channels(problem) <= MOST_CHANNELS:
-            residual = problem.horizon * self.solution.residual(tau, x).abs()
+        channels = noise_channels(problem) if self.gain else 0
+        if 0 < channels <= MOST_CHANNELS:
+            probe = None
+            if channels > MOST_COLUMNS:
+                bits = torch.randint(2, (len(x), channels), generator=rng, device=x.device)
+                probe = 2 * bits.to(x.dtype) - 1
+            compiled = self._compiled if max_steps <= FEW_STEPS and x.device.type == "cpu" else None
+            residual = problem.horizon * (compiled or self.solution.residual)(tau, x, None, probe).abs()
             weight = weight + self.gain * residual.nan_to_num(0.0).clamp(max=LARGEST)
         chosen = torch.multinomial(weight.reshape(self.groups, -1), count // self.groups, generator=rng)
         rows = torch.arange(self.groups, device=x.device).unsqueeze(-1) * (len(x) // self.groups)
