@@ -6,8 +6,6 @@ the training loss.
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -84,15 +82,13 @@ class Solution:
         return v.clamp(0, 1).masked_fill(self.problem.reached(x), 1.0).masked_fill(lost, 0.0)
 
     @torch.no_grad()
-    def residual(self, tau: Tensor, x: Tensor, u: Tensor | None = None, probe: Tensor | None = None) -> Tensor:
+    def residual(self, tau: Tensor, x: Tensor, u: Tensor | None = None) -> Tensor:
         """The HJB residual L^u V (N,), in 1/s, Eq. (parabolic_operator); the action of the critics is frozen.
 
         Args:
             tau: times to go (N,), in s.
             x: states (N, n).
             u: controls (N, m) in f and sigma, in SI units; default pi(tau, x), as in Eq. (linear_pde).
-            probe: random signs (N, w), with which the result is an unbiased estimate at the cost of one noise channel,
-                see `pirl_rl.operators`; without them it is exact.
         """
         tau, x = self._own(tau, x)
         action = self._action(tau, x)
@@ -100,12 +96,7 @@ class Solution:
         entries = max(1, self.problem.diffusion(x[:1], u[:1]).numel())
         size = max(1, CHUNK_ENTRIES // entries)
         parts = zip(*(entry.split(size) for entry in (tau, x, action, u)), strict=True)
-        probes = itertools.repeat(None) if probe is None else probe.unsqueeze(0).split(size, 1)
-        found = [
-            generator(self.critic.at(a), self.problem, t, y, v, xi).mean(0)
-            for (t, y, a, v), xi in zip(parts, probes, strict=False)
-        ]
-        return torch.cat(found, -1).view(len(x))
+        return torch.cat([generator(self.critic.at(a), self.problem, t, y, v).mean(0) for t, y, a, v in parts])
 
     # The next two are called by compiled losses. The compiler does not follow decorators of methods of objects that
     # are made while it traces, hence the blocks.

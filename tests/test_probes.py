@@ -29,7 +29,6 @@ from pirl_rl.networks import Actor, Critic, stack
 from pirl_rl.operators import generator, rademacher
 from pirl_rl.problems import HalfSpace, Reach1D
 from pirl_rl.run_directory import RunDirectory
-from pirl_rl.solution import Solution
 from pirl_rl.structure import noise_channels
 from pirl_rl.terms import target_action
 
@@ -62,20 +61,6 @@ def test_the_mean_over_all_probes_is_exact(problem, layers):
     exact = nested_generator(plain(critic, action), problem, tau, x, u)
     assert estimates.shape == (2 ** noise_channels(problem), 20)
     assert distance(estimates.mean(0), exact) < RELATIVE
-
-
-@pytest.mark.usefixtures("float64")
-@pytest.mark.parametrize("entries", [8, 2**22], ids=["in parts", "at once"])
-def test_a_solution_estimates_its_residual_without_bias(entries, monkeypatch):
-    problem = FullNoise(3, 2, 3)
-    solution = Solution(problem, Actor(problem), stack([Critic(problem) for _ in range(2)]))
-    tau, x, _, _ = points(problem, 20)
-    exact = solution.residual(tau, x)
-    monkeypatch.setattr("pirl_rl.solution.CHUNK_ENTRIES", entries)
-    signs = all_signs(noise_channels(problem), 20)
-    estimates = torch.stack([solution.residual(tau, x, probe=probe) for probe in signs])
-    torch.testing.assert_close(estimates.mean(0), exact, rtol=1e-10, atol=1e-10)
-    assert (estimates - exact).abs().max() > 1e-3
 
 
 @pytest.mark.usefixtures("float64")

@@ -58,7 +58,8 @@ class JointValue:
         self.members = len(solutions)
         self._networks = StackedNetworks([[one.actor, one.critic] for one in solutions])
         self._solution = Solution(solutions[0].problem, *self._networks.twins)  # type: ignore[arg-type]
-        self._values, self._residuals = self._lent(self._solution.raw_value), self._lent(self._solution.residual)
+        self._values = torch.func.vmap(self._lent(self._solution.raw_value))
+        self._residuals = torch.func.vmap(self._lent(self._solution.residual))
 
     def gather(self) -> None:
         """Take over the networks as they stand."""
@@ -68,22 +69,21 @@ class JointValue:
         """V (M N,) in [0, 1] at times to go tau (M N,), in s, and states x (M N, n), see `Solution.value`."""
         return self._solution.corrected(self._of_members(self._values, tau, x), x)
 
-    def residual(self, tau: Tensor, x: Tensor, u: Tensor | None = None, probe: Tensor | None = None) -> Tensor:
-        """The HJB residual (M N,), in 1/s, under the policies of the trainings or u, see `Solution.residual`."""
-        return self._of_members(self._residuals, tau, x, u, probe)
+    def residual(self, tau: Tensor, x: Tensor) -> Tensor:
+        """The HJB residual (M N,), in 1/s, under the policies of the trainings, see `Solution.residual`."""
+        return self._of_members(self._residuals, tau, x)
 
-    def _of_members(self, function: Callable[..., Tensor], *points: Tensor | None) -> Tensor:
-        own = [None if entry is None else entry.unflatten(0, (self.members, -1)) for entry in points]
-        axes = (0, *(None if entry is None else 0 for entry in own))
-        return torch.func.vmap(function, in_dims=axes)(self._networks.params, *own).flatten()
+    def _of_members(self, function: Callable[..., Tensor], tau: Tensor, x: Tensor) -> Tensor:
+        own = (entry.unflatten(0, (self.members, -1)) for entry in (tau, x))
+        return function(self._networks.params, *own).flatten()
 
-    def _lent(self, function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    def _lent(self, function: Callable[[Tensor, Tensor], Tensor]) -> Callable[..., Tensor]:
         """A function of the networks as a function of their parameters, too."""
 
-        def of_member(params: Sequence[TensorDictBase], *points: Tensor) -> Tensor:
+        def of_member(params: Sequence[TensorDictBase], tau: Tensor, x: Tensor) -> Tensor:
             kept, (actor, critic) = {"preserve_module_state": False}, self._networks.twins
             with params[0].to_module(actor, **kept), params[1].to_module(critic, **kept):
-                return function(*points)
+                return function(tau, x)
 
         return of_member
 

@@ -17,9 +17,8 @@ from pirl_rl.structure import noise_channels
 LARGEST = 2.0
 """The largest residual that counts, in units of V over the horizon: layers at faces have residuals of any size."""
 
-MOST_COLUMNS, MOST_CHANNELS = 3, 16
-"""The largest numbers of noise channels with which the residual is exact, which costs a column of derivatives for each
-of them, and with which it is computed at all."""
+MOST_CHANNELS = 16
+"""The largest number of noise channels with which the residual, which has a column for each, is computed."""
 
 FEW_STEPS = 100
 """The largest number of control steps in the horizon with which the residual is compiled, on a CPU.
@@ -35,8 +34,8 @@ class HasValue(Protocol):
         """V (N,) in [0, 1] at times to go tau (N,), in s, and states x (N, n)."""
         ...
 
-    def residual(self, tau: Tensor, x: Tensor, u: Tensor | None = None, probe: Tensor | None = None) -> Tensor:
-        """The HJB residual (N,), in 1/s, under its policy or u, see `pirl_rl.solution.Solution.residual`."""
+    def residual(self, tau: Tensor, x: Tensor) -> Tensor:
+        """The HJB residual of V under its policy (N,), in 1/s, at times to go tau (N,), in s, and states x (N, n)."""
         ...
 
 
@@ -50,8 +49,7 @@ class UndecidedStates:
 
     The residual shows where the networks are wrong, before any outcome does. A state may be rare in the box and matter
     all the same, as between two ways past an obstacle that are equally good. Points of a physics-informed network are
-    drawn in the same way (C. Wu et al., Computer Methods in Applied Mechanics and Engineering 403, 2023). With more
-    than `MOST_COLUMNS` noise channels its trace is estimated with one random vector, see `pirl_rl.operators`.
+    drawn in the same way (C. Wu et al., Computer Methods in Applied Mechanics and Engineering 403, 2023).
 
     Copies for other processes lose the networks, which would be out of date there, and take the states as they come.
 
@@ -87,13 +85,8 @@ class UndecidedStates:
                 "initial_states: expected 0 < floor <= 1, candidates >= 1 and gain >= 0, "
                 f"got {floor}, {candidates} and {gain}"
             )
-        self.others, self.clock, self.floor, self.candidates, self.gain = (
-            others,
-            simulator.clock,
-            floor,
-            candidates,
-            gain,
-        )
+        self.others, self.clock = others, simulator.clock
+        self.floor, self.candidates, self.gain = floor, candidates, gain
         self.take_value_of(solution)
         if compile:
             self._compiled = Compiled(solution.residual, "the residual of V at initial states")
@@ -121,14 +114,9 @@ class UndecidedStates:
         # The trainer reports networks that have diverged.
         v = self.solution.value(tau, x).nan_to_num(0.5).clamp(0, 1)
         weight = self.floor + (1 - self.floor) * 4 * v * (1 - v)
-        channels = noise_channels(problem) if self.gain else 0
-        if 0 < channels <= MOST_CHANNELS:
-            probe = None
-            if channels > MOST_COLUMNS:
-                bits = torch.randint(2, (len(x), channels), generator=rng, device=x.device)
-                probe = 2 * bits.to(x.dtype) - 1
+        if self.gain and noise_channels(problem) <= MOST_CHANNELS:
             compiled = self._compiled if max_steps <= FEW_STEPS and x.device.type == "cpu" else None
-            residual = problem.horizon * (compiled or self.solution.residual)(tau, x, None, probe).abs()
+            residual = problem.horizon * (compiled or self.solution.residual)(tau, x).abs()
             weight = weight + self.gain * residual.nan_to_num(0.0).clamp(max=LARGEST)
         chosen = torch.multinomial(weight.reshape(self.groups, -1), count // self.groups, generator=rng)
         rows = torch.arange(self.groups, device=x.device).unsqueeze(-1) * (len(x) // self.groups)
