@@ -383,8 +383,10 @@ def test_networks_that_have_diverged_give_equal_weights():
     assert Safety1D().interior(x).all()
 
 
-def test_copies_for_other_processes_draw_with_equal_weights():
-    law = pickle.loads(pickle.dumps(UndecidedStates(UniformStates(), Known(), Simulator(Safety1D()))))
+@pytest.mark.parametrize("compile", [False, True])
+def test_copies_for_other_processes_draw_with_equal_weights(compile):
+    law = UndecidedStates(UniformStates(), Known(), Simulator(Safety1D()), compile=compile)
+    law = pickle.loads(pickle.dumps(law))
     assert torch.equal(draw(Safety1D(), law)[1], draw(Safety1D(), UniformStates())[1])
 
 

@@ -59,6 +59,20 @@ def test_groups_are_drawn_by_their_own_weights():
     assert below.tolist() == pytest.approx([0.8, 0.2], abs=0.01 + 4 * (0.16 / 2_000) ** 0.5)
 
 
+def test_trainings_that_draw_together_leave_the_compiled_residual_of_the_first_one(tmp_path, monkeypatch):
+    said, values = [], []
+    monkeypatch.setattr("pirl_rl.compilation.announce", said.append)
+    members, simulator = trainers(tmp_path), Simulator(Reach1D(), 0.1)
+    laws = [UndecidedStates(UniformStates(), one.solution, simulator, gain=1.0, compile=True) for one in members]
+    rng = torch.Generator().manual_seed(0)
+    joint = together(laws, values)
+    assert joint is not None
+    joint.sample(Reach1D(), 30, 20, rng, torch.float32)
+    assert said == []
+    laws[0].sample(Reach1D(), 30, 20, rng, torch.float32)
+    assert said == ["compiling the residual of V at initial states"]
+
+
 @pytest.mark.parametrize("drawn", [2**18, 30])
 def test_states_are_in_the_order_of_the_trainings(drawn, monkeypatch, tmp_path):
     """With one training whose V is 1/2 left of 0 and with another one for which that is so on the right."""
