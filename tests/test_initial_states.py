@@ -326,6 +326,31 @@ def test_undecided_states_come_by_their_weights():
     assert undecided.double().mean().item() == pytest.approx(4 / 7, abs=0.01 + 4 * (12 / 49 / count) ** 0.5)
 
 
+class Counted(UniformStates):
+    """Uniform states, with the numbers that were asked for."""
+
+    def __init__(self, asked):
+        super().__init__()
+        self.asked = asked
+
+    def sample(self, problem, count, *others):
+        self.asked.append(count)
+        return super().sample(problem, count, *others)
+
+
+@pytest.mark.parametrize(("count", "asked", "drawn"), [(1, 4, 1), (10, 12, 3), (400, 400, 100)])
+def test_several_draws_share_their_candidates(count, asked, drawn):
+    """Each draw takes a quarter of the candidates without replacement, and the next one another quarter of them."""
+    numbers = []
+    law = UndecidedStates(Counted(numbers), Known(), Simulator(Safety1D()))
+    steps, x = law.sample(Safety1D(), count, 20, torch.Generator().manual_seed(0), torch.float64)
+    assert numbers == [asked]
+    assert (len(steps), len(x)) == (count, count)
+    draws = x.flatten().split(drawn)
+    assert all(len(draw.unique()) == len(draw) for draw in draws)
+    assert count < 400 or 200 < len(x.unique(dim=0)) < 350  # four draws of the same quarter have 100, of all states 400
+
+
 class Wrong(Known):
     """V = 1, with a residual of -0.4 1/s where x > 0, of 1,000 1/s where x < -1/2, and of 0 between."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Protocol
 
 import torch
@@ -42,10 +43,12 @@ class HasValue(Protocol):
 class UndecidedStates:
     """States of another distribution, more often where V is neither near 0 nor near 1, and where it is wrong.
 
-    In many dimensions most of a box is lost or safe whatever the control is, and a path from there teaches little. Of
-    `candidates` times as many states as are needed, each is therefore drawn, without replacement, with a weight of
+    In many dimensions most of a box is lost or safe whatever the control is, and a path from there teaches little. One
+    of `candidates` states is therefore drawn, without replacement, with a weight of
     floor + (1 - floor) 4 V (1 - V) + gain min(T |L^pi V|, 2), where V and its HJB residual, Eq. (parabolic_operator),
-    are those of the networks as they stand, at the time to go of the episode, and T is the horizon.
+    are those of the networks as they stand, at the time to go of the episode, and T is the horizon. Such a draw is
+    repeated with the same states as often as it takes for all the states that are needed, because the residual costs
+    more than the rest. A state that is drawn several times begins paths with different noise.
 
     The residual shows where the networks are wrong, before any outcome does. A state may be rare in the box and matter
     all the same, as between two ways past an obstacle that are equally good. Points of a physics-informed network are
@@ -58,7 +61,7 @@ class UndecidedStates:
         solution: gives V.
         simulator: its clock turns control steps to go into times to go.
         floor: the weight of a state at which V is 0 or 1, where a state at which V = 1/2 has the weight 1; in (0, 1].
-        candidates: the number of candidates for each state, >= 1.
+        candidates: the number of states of which a draw takes one, >= 1.
         gain: the factor of the residual, >= 0; 0 leaves it out, and so do more than `MOST_CHANNELS` columns of sigma.
         compile: whether the residual may be compiled, see `FEW_STEPS`.
 
@@ -109,7 +112,10 @@ class UndecidedStates:
     ) -> tuple[Tensor, Tensor]:
         if self.solution is None:
             return self.others.sample(problem, count, max_steps, rng, dtype, visited)
-        steps, x = self.others.sample(problem, self.candidates * count, max_steps, rng, dtype, visited)
+        needed = count // self.groups
+        drawn = math.ceil(needed / self.candidates)
+        size = self.groups * self.candidates * drawn
+        steps, x = self.others.sample(problem, size, max_steps, rng, dtype, visited)
         tau = self.clock.time(steps).to(x)
         # The trainer reports networks that have diverged.
         v = self.solution.value(tau, x).nan_to_num(0.5).clamp(0, 1)
@@ -118,7 +124,9 @@ class UndecidedStates:
             compiled = self._compiled if max_steps <= FEW_STEPS and x.device.type == "cpu" else None
             residual = problem.horizon * (compiled or self.solution.residual)(tau, x).abs()
             weight = weight + self.gain * residual.nan_to_num(0.0).clamp(max=LARGEST)
-        chosen = torch.multinomial(weight.reshape(self.groups, -1), count // self.groups, generator=rng)
+        draws = math.ceil(needed / drawn)
+        weights = weight.reshape(self.groups, -1).repeat_interleave(draws, 0)
+        chosen = torch.multinomial(weights, drawn, generator=rng).reshape(self.groups, -1)[:, :needed]
         rows = torch.arange(self.groups, device=x.device).unsqueeze(-1) * (len(x) // self.groups)
         chosen = (chosen + rows).flatten()
         return steps[chosen], x[chosen]
