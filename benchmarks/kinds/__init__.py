@@ -4,6 +4,7 @@ from benchmarks.kinds.approaches import Chain, Gantry, Pursuit, Rendezvous, Unic
 from benchmarks.kinds.compartments import Anaesthesia, HerdImmunity, LotkaVolterra, LynxAndHare, Rooms
 from benchmarks.kinds.cycles import JetLag, PowerSwing, Runaway, Searchlight
 from benchmarks.kinds.demands import Backburn, ChemoWard, IslandGrid, VaccineStock
+from benchmarks.kinds.fields import Flywheels, Minefield
 from benchmarks.kinds.flights import Descent, Encounter
 from benchmarks.kinds.journeys import Barge, Scooter, SolarCar
 from benchmarks.kinds.lines import Casino, Gene, Tightrope, Uphill, Washboard
@@ -29,6 +30,6 @@ KINDS += (LotkaVolterra, Chain, Unicycle, Rendezvous, FastRiver, Glider, Reactor
 KINDS += (VaccineStock, Backburn, ChemoWard, IslandGrid, StraitFerry, QuietStance, LynxAndHare, HerdImmunity)
 KINDS += (TackingYacht, Encounter, Descent, Gantry, Endowment, Granary, PairTrade, Chemostat)
 KINDS += (SolarCar, Scooter, Barge, Tightrope, Casino, Washboard, Uphill, Gene)
-KINDS += (Fjord, Drawbridge, Levee, Convection)
+KINDS += (Fjord, Drawbridge, Levee, Convection, Minefield, Flywheels)
 
 PROBLEMS = {kind.__name__: kind for kind in KINDS} | OTHERS
