@@ -2,9 +2,8 @@
 
 from benchmarks.kinds.approaches import Chain, Gantry, Pursuit, Rendezvous, Unicycle
 from benchmarks.kinds.compartments import Anaesthesia, HerdImmunity, LotkaVolterra, LynxAndHare, Rooms
-from benchmarks.kinds.cycles import JetLag, PowerSwing, Runaway, Searchlight
+from benchmarks.kinds.cycles import Flywheels, JetLag, PowerSwing, Runaway, Searchlight
 from benchmarks.kinds.demands import Backburn, ChemoWard, IslandGrid, VaccineStock
-from benchmarks.kinds.fields import Flywheels, Minefield
 from benchmarks.kinds.flights import Descent, Encounter
 from benchmarks.kinds.journeys import Barge, Scooter, SolarCar
 from benchmarks.kinds.lines import Casino, Gene, Tightrope, Uphill, Washboard
@@ -17,7 +16,7 @@ from benchmarks.kinds.plants import Epidemic, Investor, Reactor, Reservoir, Togg
 from benchmarks.kinds.stores import Chemostat, FastCharge, Ferment, Fishery, Forager
 from benchmarks.kinds.swings import Duffing, MountainCar, QuietStance, Swingup
 from benchmarks.kinds.vehicles import Bicycle, Evader, Loiter, Ring, River, Slalom, Steering, TwoCars, TwoHarbours
-from benchmarks.kinds.waters import Convection, Drawbridge, Fjord, Levee
+from benchmarks.kinds.waters import Convection, Drawbridge, Fjord, Levee, Minefield
 from pirl_rl import ReachAvoidProblem
 
 __all__ = ["KINDS", "PROBLEMS", "Mixture"]

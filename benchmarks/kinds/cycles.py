@@ -1,4 +1,4 @@
-"""A reactor, a generator, a body clock and a searchlight: drifts that jump, and periodic states."""
+"""A reactor, a generator, a body clock, a searchlight and two flywheels: drifts that jump, and periodic states."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from benchmarks.kinds.shapes import rows
+from benchmarks.kinds.shapes import constant, rows
 from pirl_rl import Box, ReachAvoidProblem
 
 
@@ -95,3 +95,28 @@ class PowerSwing(ReachAvoidProblem):
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
         return rows(2.6 - x[..., 0], x[..., 0] + 0.5)
+
+
+class Flywheels(ReachAvoidProblem):
+    """Bring two flywheels, which pull each other, to the same mark within 12 s, never in opposite phase; in rad and s.
+
+    The phases are those of Y. Kuramoto's oscillators, and the control turns the first one.
+    """
+
+    horizon = 12.0
+    states = Box([-math.pi, -math.pi], [math.pi, math.pi], periodic=[0, 1])
+    controls = Box([-1.0], [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        first, second = x.unbind(-1)
+        pull = 0.4 * (second - first).sin()
+        return rows(0.2 + pull + u[..., 0], 0.5 - pull)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return constant(x, [0.3, 0.0], [0.0, 0.4])
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return 0.93 - x.cos().amin(-1)
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        return 0.9 + (x[..., 0] - x[..., 1]).cos()

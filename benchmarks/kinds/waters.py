@@ -1,4 +1,4 @@
-"""A fjord, a drawbridge, a levee and a heated layer of water, where way, moment or foresight decide."""
+"""A fjord, a drawbridge, a levee, a heated layer of water and a mined strait: way, moment or foresight decide."""
 
 from __future__ import annotations
 
@@ -103,3 +103,25 @@ class Convection(ReachAvoidProblem):
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
         return torch.cat([x - x.new_tensor(self.states.low), x.new_tensor(self.states.high) - x], -1)
+
+
+class Minefield(ReachAvoidProblem):
+    """Cross a strait of 10 km within 14 h, past nine mines, in a current that turns; km and km/h."""
+
+    horizon = 14.0
+    states, controls = Box([0.0, 0.0], [10.0, 10.0]), Box([-1.2, -1.2], [1.2, 1.2])
+    MINES = ((2.0, 1.5), (2.2, 4.4), (2.0, 7.6), (5.0, 3.0), (5.2, 5.9), (4.9, 8.8), (7.6, 1.6), (7.9, 4.5), (7.7, 7.4))
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        along, across = (math.pi * x / 10).unbind(-1)
+        return u + 0.4 * rows(-across.cos(), along.cos())
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return constant(x, [0.35, 0.0], [0.0, 0.35])
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return 10 - x[..., 0]
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        mines = (x.unsqueeze(-2) - x.new_tensor(self.MINES)).norm(dim=-1) - 0.7
+        return torch.cat([mines, x, 10 - x[..., 1:]], -1)
