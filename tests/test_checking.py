@@ -11,7 +11,7 @@ import pirl_rl
 import pirl_rl.errors
 from benchmarks.kinds import Orbit
 from pirl_rl import Box, Plane, ReachAvoidProblem, payoffs, problems
-from pirl_rl.checking import check, examine, report
+from pirl_rl.checking import Finding, check, examine, report
 from pirl_rl.commands.check import main
 from pirl_rl.errors import ProblemError
 from pirl_rl.problems import DoubleIntegrator, DubinsCar, HalfSpace, Pendulum, Reach1D, ZermeloBoat
@@ -127,6 +127,13 @@ class ReversedAvoid(ZermeloBoat):
 
     def target_level(self, x):
         return (x - x.new_tensor([3.0, 0.0])).norm(dim=-1) - 0.05
+
+
+class EitherShoal(ZermeloBoat):
+    """A shoal is meant where both levels are at most 0; as constraints, one is enough for the avoid set."""
+
+    def avoid_constraints(self, x):
+        return torch.stack([x[..., 0] - 1.0, x[..., 1] + 0.5], -1)
 
 
 class Indicator(ZermeloBoat):
@@ -340,6 +347,7 @@ FAULTS = [
     (AvoidsEverything, "error", "states", "none in the box"),
     (ReversedTarget, "warning", "target_level", "must be <= 0 inside"),
     (ReversedAvoid, "warning", "avoid_level", "must be <= 0 inside"),
+    (EitherShoal, "note", "avoid_constraints", "fills (7[5-9]|8[0-5])% of the box; .* at least one of"),
     (Indicator, "warning", "target_level", "derivative is 0"),
     (FlatTarget, "warning", "target_level", "no slope at a face of the target"),
     (FlatWall, "warning", "avoid_constraints", "no slope at a face of the avoid set"),
@@ -437,6 +445,14 @@ def test_a_point_and_a_line_are_shown():
     line = int(undefined.place.rpartition(" ")[2])
     with open(__file__, encoding="utf-8") as file:
         assert "def drift" in file.read().splitlines()[line - 1]
+
+
+def test_of_many_coordinates_the_first_are_shown():
+    point = tuple(float(i) for i in range(100))
+    assert str(Finding("note", "Long.drift", "slow.", point=point)) == (
+        "Long.drift: slow. For example at x = [0, 1, 2, 3, 4, 5, 6, 7, ... (100 coordinates)]."
+    )
+    assert str(Finding("note", "Short.drift", "slow.", point=point[:8])).endswith("at x = [0, 1, 2, 3, 4, 5, 6, 7].")
 
 
 def test_an_exception_is_shown_with_the_line_that_raised_it():

@@ -15,6 +15,9 @@ from pirl_rl.problem import ReachAvoidProblem
 
 Level = Literal["error", "warning", "note"]
 
+MOST_COORDINATES = 8
+"""The largest number of coordinates of a state that a sentence shows."""
+
 OF_NUMPY = ("numpy()", "access data pointer")
 """What torch's errors about functions of numpy contain."""
 
@@ -40,8 +43,7 @@ class Finding:
 
     def __str__(self) -> str:
         place = f" ({self.place})" if self.place else ""
-        point = "" if self.point is None else f" For example at x = [{', '.join(f'{c:.6g}' for c in self.point)}]."
-        return f"{self.subject}{place}: {self.message}{point}"
+        return f"{self.subject}{place}: {self.message}{'' if self.point is None else _example(self.point)}"
 
 
 def found(
@@ -90,6 +92,13 @@ def hint(error: str) -> str:
     if not any(sign in error for sign in OF_NUMPY):
         return ""
     return " (physics and levels need functions of torch, such as torch.sin and torch.maximum, and not those of numpy)"
+
+
+def _example(point: tuple[float, ...]) -> str:
+    """A sentence with a state, of which it shows the first `MOST_COORDINATES` coordinates."""
+    numbers = ", ".join(f"{coordinate:.6g}" for coordinate in point[:MOST_COORDINATES])
+    rest = f", ... ({len(point)} coordinates)" if len(point) > MOST_COORDINATES else ""
+    return f" For example at x = [{numbers}{rest}]."
 
 
 def report(findings: Iterable[Finding], levels: Iterable[Level] = ("error", "warning", "note")) -> str:

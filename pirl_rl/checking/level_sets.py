@@ -20,6 +20,9 @@ STARTS = 64
 MOST = 0.95
 """The share of the box from which a set is suspected to have the wrong sign."""
 
+MUCH = 0.5
+"""The share of the box from which a set is mentioned, since most problems have smaller ones."""
+
 NEAR = 1e-3
 """How far from a face its level is taken, as a share of the way to a state outside."""
 
@@ -48,6 +51,9 @@ def sizes(samples: Samples) -> Iterator[Finding]:
         if share >= MOST:
             message = f"the {what} fills {share:.0%} of the box; its level must be <= 0 inside and > 0 outside the set."
             yield found(problem, "warning", part, message)
+        elif share >= MUCH:
+            message = f"the {what} fills {share:.0%} of the box; paths start in the rest of it.{_combination(part)}"
+            yield found(problem, "note", part, message)
     try:
         sample_interior(problem, problem.states, 1, torch.Generator().manual_seed(0), torch.float64)
     except ProblemError:
@@ -133,6 +139,14 @@ def _level(problem: ReachAvoidProblem, what: str) -> Callable[[Tensor], Tensor]:
     if what == "avoid set":
         return problem.scaled_avoid_level
     return problem.scaled_reached_level
+
+
+def _combination(part: str) -> str:
+    """How several constraints make up a set, for a set that is given by them."""
+    return {
+        "target_constraints": " A state is in the target where all the constraints are <= 0.",
+        "avoid_constraints": " A state is in the avoid set where at least one of the constraints is <= 0.",
+    }.get(part, "")
 
 
 def _sets(samples: Samples):
