@@ -7,8 +7,10 @@ A control is held for dt. The SDE is integrated with sub-steps of length h = dt 
 The rule `crossing` names the drift f of a sub-step, and how an exit within it is detected:
 
 - "endpoint": f = f(x, u) at its start, the Euler-Maruyama scheme, and an exit is detected only at its end.
-- "bridge": f = f(x + f(x, u) h/2, u) at its middle, which gives no energy to oscillations, and between its ends the
-  path is a Brownian bridge, which may cross faces, see `pirl_rl.crossings`.
+- "bridge": f is the mean of f(x, u) and of f(x', u) at the end x' of the Euler-Maruyama step with the same noise. Where
+  sigma is constant the scheme has weak order two (P. E. Kloeden and E. Platen, Numerical Solution of Stochastic
+  Differential Equations, section 15.1), and it gives no energy to oscillations. Between its ends the path is a Brownian
+  bridge, which may cross faces, see `pirl_rl.crossings`.
 
 A path that both reaches A and enters B within one sub-step counts as a failure. So does a path that leaves for
 infinity, because its drift grows too fast, or whose state has no number. Periodic coordinates are brought back into
@@ -74,8 +76,6 @@ def exit_value(problem: ReachAvoidProblem, step: Step) -> Tensor:
 def midpoint_drift(problem: ReachAvoidProblem, x: Tensor, u: Tensor, drift: Tensor, h: Tensor | float) -> Tensor:
     """f(x + f(x, u) h/2, u) (N, n), the drift at the middle of a step of the length h without noise.
 
-    It is f(x, u) where the middle lies at a state at which the physics is undefined, as inside a set.
-
     Args:
         problem: the physics.
         x: states (N, n).
@@ -83,14 +83,27 @@ def midpoint_drift(problem: ReachAvoidProblem, x: Tensor, u: Tensor, drift: Tens
         drift: f(x, u) (N, n).
         h: the length of the step in s, which broadcasts with (N, n).
     """
-    middle = problem.states.wrap(x + drift * (h / 2))
-    # Where the drift has no number the middle has none, and there a drift may well have one again: the sum has none.
+    return drift_after(problem, x, u, drift, drift * (h / 2))
+
+
+def drift_after(problem: ReachAvoidProblem, x: Tensor, u: Tensor, drift: Tensor, move: Tensor) -> Tensor:
+    """f(x + move, u) (N, n), and f(x, u) where x + move is a state at which the physics is undefined, as inside a set.
+
+    Args:
+        problem: the physics.
+        x: states (N, n).
+        u: physical controls (N, m).
+        drift: f(x, u) (N, n).
+        move: how far the states move (N, n), in their units.
+    """
+    moved = problem.states.wrap(x + move)
+    # Where the drift has no number `moved` has none, and there a drift may well have one again: the sum has none.
     if torch.is_grad_enabled():
         with torch.no_grad():
-            defined = (problem.drift(middle, u) + drift).isfinite().all(-1, keepdim=True)
-        return problem.drift(torch.where(defined, middle, x), u)
-    at_middle = problem.drift(middle, u)
-    return torch.where((at_middle + drift).isfinite(), at_middle, drift)
+            defined = (problem.drift(moved, u) + drift).isfinite().all(-1, keepdim=True)
+        return problem.drift(torch.where(defined, moved, x), u)
+    after = problem.drift(moved, u)
+    return torch.where((after + drift).isfinite(), after, drift)
 
 
 @dataclass(frozen=True)
@@ -235,10 +248,12 @@ class Simulator:
             x = self.problem.states.wrap(x + self._drift(x, u, h) * h)
         return x
 
-    def _drift(self, x: Tensor, u: Tensor, h: Tensor | float) -> Tensor:
-        """The drift f (N, n) of Eq. (sub_step) with a length h that broadcasts with (N, n)."""
+    def _drift(self, x: Tensor, u: Tensor, h: Tensor | float, kick: Tensor | float = 0.0) -> Tensor:
+        """The drift f (N, n) of Eq. (sub_step) for sigma dW = kick (N, n); the length h broadcasts with (N, n)."""
         drift = self.problem.drift(x, u)
-        return drift if self.crossing == "endpoint" else midpoint_drift(self.problem, x, u, drift, h)
+        if self.crossing == "endpoint":
+            return drift
+        return (drift + drift_after(self.problem, x, u, drift, drift * h + kick)) / 2
 
     def _draw(self, x: Tensor, rng: torch.Generator | None, crossings: bool) -> Draws:
         """The random numbers of a sub-step.
@@ -280,7 +295,7 @@ class Simulator:
         """One sub-step: states (N, n), sigma dW (N, n), and whether paths are in A and in B or crossed a face."""
         problem, sigma = self.problem, self.sigma(x, u, constant)
         kick = times(sigma, (noise * h.sqrt()).mT)
-        moved = problem.states.wrap(x + self._drift(x, u, h[..., None]) * h[..., None] + kick)
+        moved = problem.states.wrap(x + self._drift(x, u, h[..., None], kick) * h[..., None] + kick)
         lost = ~(problem.states.normalize(moved).abs() <= LOST).all(-1)
         moved, kick = (torch.where(lost.unsqueeze(-1), *pair) for pair in ((x, moved), (torch.zeros_like(kick), kick)))
         reached, failed = problem.reached(moved), problem.failed(moved) | lost

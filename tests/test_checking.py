@@ -411,7 +411,7 @@ def test_a_level_that_is_zero_all_over_its_set_gives_no_alarm():
 
 
 def test_steps_are_checked_by_the_scheme_that_plays_them():
-    """Two Euler steps of 0.25 s turn a state by 0.3 rad and out by 0.02, which midpoint steps do not."""
+    """Two Euler steps of 0.25 s turn a state by 0.3 rad and out by 0.02, which those of second order do not."""
 
     class Turn(DoubleIntegrator):
         def drift(self, x, u):

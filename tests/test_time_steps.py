@@ -201,14 +201,14 @@ def test_a_stiff_system_has_substeps_that_resolve_it():
     decay = torch.exp(-a * 0.05)
     exact = x * decay + drive / a * (1 - decay)
     error = (Simulator(problem, 0.05, steps.substeps).flow(x, u) - exact).abs().amax(-1) / 2
-    # Ten times as many midpoint steps have a hundredth of the error, so that the difference is 99/100 of it.
+    # Ten times as many steps of second order have a hundredth of the error, so that the difference is 99/100 of it.
     assert error.quantile(0.95) <= 1.05 * TOLERANCE
     half = (Simulator(problem, 0.05, steps.substeps // 2).flow(x, u) - exact).abs().amax(-1) / 2
     assert steps.substeps // 2 < 0.05 * 200 or half.quantile(0.95) > TOLERANCE
 
 
 def test_steps_of_euler_are_checked_as_such():
-    """A turn by a = 0.3 rad in k steps ends too far out by a^2/2k, or is off by a^3/6k^2 with midpoint steps.
+    """A turn by a = 0.3 rad in k steps ends too far out by a^2/2k, or is off by a^3/6k^2 with steps of second order.
 
     States at the 95 % quantile lie about 1.2 from the center, and the error may be 0.002.
     """
