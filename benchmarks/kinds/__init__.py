@@ -11,10 +11,10 @@ from benchmarks.kinds.markets import Endowment, Granary, PairTrade
 from benchmarks.kinds.masses import Crosswind, Gusty, Lander, Orbit, Servo, Sprint, VanDerPol
 from benchmarks.kinds.mixtures import Bearing, Mirror, Mixture
 from benchmarks.kinds.other_constants import OTHERS
-from benchmarks.kinds.passages import FastRiver, Glider, SlotChange, StraitFerry, TackingYacht, TwoLink
+from benchmarks.kinds.passages import FastRiver, Glider, SlotChange, StraitFerry, TackingYacht, TwoDoors, TwoLink
 from benchmarks.kinds.plants import Epidemic, Investor, Reactor, Reservoir, Toggle, Tokens, TwoTanks
 from benchmarks.kinds.stores import Chemostat, FastCharge, Ferment, Fishery, Forager
-from benchmarks.kinds.swings import Duffing, MountainCar, QuietStance, Swingup
+from benchmarks.kinds.swings import Duffing, LongWatch, MountainCar, QuietStance, Swingup
 from benchmarks.kinds.vehicles import Bicycle, Evader, Loiter, Ring, River, Slalom, Steering, TwoCars, TwoHarbours
 from benchmarks.kinds.waters import Convection, Drawbridge, Fjord, Levee, Minefield
 from pirl_rl import ReachAvoidProblem
@@ -29,6 +29,6 @@ KINDS += (LotkaVolterra, Chain, Unicycle, Rendezvous, FastRiver, Glider, Reactor
 KINDS += (VaccineStock, Backburn, ChemoWard, IslandGrid, StraitFerry, QuietStance, LynxAndHare, HerdImmunity)
 KINDS += (TackingYacht, Encounter, Descent, Gantry, Endowment, Granary, PairTrade, Chemostat)
 KINDS += (SolarCar, Scooter, Barge, Tightrope, Casino, Washboard, Uphill, Gene)
-KINDS += (Fjord, Drawbridge, Levee, Convection, Minefield, Flywheels)
+KINDS += (Fjord, Drawbridge, Levee, Convection, Minefield, Flywheels, LongWatch, TwoDoors)
 
 PROBLEMS = {kind.__name__: kind for kind in KINDS} | OTHERS

@@ -1,4 +1,4 @@
-"""A satellite, an arm, a boat, a ferry, a yacht and a glider: obstacles are passed on either side, or against time."""
+"""A satellite, an arm, boats, a glider and two doors: obstacles are passed on either side, or against time."""
 
 from __future__ import annotations
 
@@ -179,3 +179,24 @@ class TackingYacht(ReachAvoidProblem):
         shank = torch.maximum((east - 1.0).abs() - 0.2, (north - 0.1).abs() - 0.9)
         foot = torch.maximum((east - 0.3).abs() - 0.9, (north + 0.6).abs() - 0.2)
         return torch.minimum(shank, foot)
+
+
+class TwoDoors(ReachAvoidProblem):
+    """Reach the target behind a wall through a narrow door, at which the noise is strong, or through a wide one."""
+
+    horizon = 6.0
+    states, controls = Box([-2.0, -2.0], [2.0, 2.0]), Box([-1.0, -1.0], [1.0, 1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return 1.2 * u
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        noise = 0.2 + 0.3 * (-4 * (x - x.new_tensor([0.0, -0.8])).square().sum(-1)).exp()
+        return torch.diag_embed(rows(noise, noise))
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return (x - x.new_tensor([1.4, -0.8])).norm(dim=-1) - 0.3
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        wall, narrow, wide = x[..., 0].abs() - 0.15, 0.2 - (x[..., 1] + 0.8).abs(), 0.45 - (x[..., 1] - 1.2).abs()
+        return torch.cat([rows(wall, narrow, wide).amax(-1, keepdim=True), 2.0 - x.abs()], -1)

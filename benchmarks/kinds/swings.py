@@ -1,4 +1,4 @@
-"""A mass in two wells, a car in a valley, a pendulum and a person on a shaking platform, whose forces are weak."""
+"""A mass in two wells, a car in a valley, a pendulum, a person on a shaking platform, a mirror: forces are weak."""
 
 from __future__ import annotations
 
@@ -95,3 +95,24 @@ class QuietStance(ReachAvoidProblem):
     def avoid_constraints(self, x: Tensor) -> Tensor:
         lean, rate = x.unbind(-1)
         return rows(lean + 5.0, 9.0 - lean, 20.0 - rate.abs())
+
+
+class LongWatch(ReachAvoidProblem):
+    """A mirror on a spring has to keep its angle and its rate small for eighty of its periods, against gusts.
+
+    A control matters within a period and hardly changes V, but what it changes adds up over the horizon.
+    """
+
+    objective = "invariance"
+    horizon = 500.0
+    states, controls = Box([-2.0, -2.0], [2.0, 2.0]), Box([-0.3], [0.3])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        angle, rate = x.unbind(-1)
+        return rows(rate, u[..., 0] - angle - 0.4 * rate)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return constant(x, [0.0], [0.6])
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        return 2.0 - x.abs().amax(-1)
