@@ -76,6 +76,8 @@ def exit_value(problem: ReachAvoidProblem, step: Step) -> Tensor:
 def midpoint_drift(problem: ReachAvoidProblem, x: Tensor, u: Tensor, drift: Tensor, h: Tensor | float) -> Tensor:
     """f(x + f(x, u) h/2, u) (N, n), the drift at the middle of a step of the length h without noise.
 
+    See `drift_after` for a middle at which the physics is undefined.
+
     Args:
         problem: the physics.
         x: states (N, n).

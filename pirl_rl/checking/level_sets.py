@@ -21,7 +21,7 @@ MOST = 0.95
 """The share of the box from which a set is suspected to have the wrong sign."""
 
 MUCH = 0.5
-"""The share of the box from which a set is mentioned, since most problems have smaller ones."""
+"""The share of the box from which a set is mentioned: few problems mean one that large."""
 
 NEAR = 1e-3
 """How far from a face its level is taken, as a share of the way to a state outside."""
