@@ -2,9 +2,10 @@
 
 A control is held during a control step, so that in one step a path should neither cross much of the box of states nor
 pass through a set, nor should the noise carry it far across a surface where the best control jumps. The control step is
-the longest for which the moves of drift and noise, and what holding the control costs, are below the bounds that stand
-here. Within it the drift is integrated in sub-steps. They resolve its fastest rate, and they are halved until a
-control step without noise is that of ten times as many.
+the longest for which the moves of drift and noise, and the success that holding the control costs, are below the bounds
+that stand here. Up to two states this success is measured on a grid, see `pirl_rl.grid.held`. Within a control step the
+drift is integrated in sub-steps. They resolve its fastest rate, and they are halved until a control step without noise
+is that of ten times as many.
 """
 
 from __future__ import annotations
@@ -14,10 +15,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pirl_rl.errors import ArgumentError
+from pirl_rl.errors import ArgumentError, ProblemError
+from pirl_rl.grid import GridSolver
+from pirl_rl.grid.held import loss_of_holding
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.rates import Move, across_box, across_sets, control_rate, fastest_rate
 from pirl_rl.simulator import Crossing, Simulator
+from pirl_rl.structure import has_controlled_noise
 
 SHARES = {"the box": (0.05, 0.1), "the target": (0.5, 0.5), "the avoid set": (0.5, 0.5)}
 """The largest moves of drift and noise in one control step, in widths of the box and depths of the sets."""
@@ -25,14 +29,21 @@ SHARES = {"the box": (0.05, 0.1), "the target": (0.5, 0.5), "the avoid set": (0.
 STEPS = (400, 500, 600, 800)
 """The numbers of control steps in the horizon from which one is taken where moves across box and sets limit it."""
 
-HELD = 3.5e-3
-"""The largest `control_rate`, times control step and horizon, that is accepted."""
+LOST = 2e-3
+"""The largest mean success lost by holding the control that is accepted."""
+
+LEAST_SHARE = 0.6
+"""The success lost, in `control_rate` times control step and horizon: at least so much on all problems where both are
+large, and more where V is sharp."""
 
 SHORT_STEPS = (800, 1_600)
 """The numbers of control steps in the horizon from which one is taken where holding the control limits it."""
 
-MOST_STATES = 2
-"""The largest number of states with which holding the control limits the step, see docs/recipe.md."""
+NODES = {1: 201, 2: 81}
+"""The number of nodes along each axis of the grid on which the lost success is measured, by the number of states.
+
+With more states holding the control does not limit the step, see docs/recipe.md.
+"""
 
 TOLERANCE = 1e-3
 """The largest error of a control step without noise, in widths of the box, that is accepted."""
@@ -92,8 +103,13 @@ def propose_time_steps(
     x, u = _samples(problem, samples, seed)
     moves, rate = [across_box(problem, x, u), *across_sets(problem, x, u)], fastest_rate(problem, x, u)
     if dt is None:
-        held = control_rate(problem, x, u) if problem.states.dim <= MOST_STATES else 0.0
-        chosen, limit = _control_step(problem.horizon, moves, held)
+        steps, limit = _steps_of_moves(problem.horizon, moves)
+        longest = problem.horizon / steps
+        lost = _lost(problem, longest, _substeps(problem, longest, crossing, rate, x, u), x, u)
+        if lost > LOST:
+            steps = next((short for short in SHORT_STEPS if lost * steps <= LOST * short), SHORT_STEPS[-1])
+            limit = f"Holding the control for {longest:.4g} s costs about {lost:.1g} of success."
+        chosen = problem.horizon / steps
     else:
         chosen, limit = dt, ""
     count = _substeps(problem, chosen, crossing, rate, x, u) if substeps is None else substeps
@@ -138,22 +154,34 @@ def _longest(move: Move) -> float:
     return min(by_drift, (noise / move.spread) ** 2) if move.spread > 0 else by_drift
 
 
-def _control_step(horizon: float, moves: list[Move], held: float) -> tuple[float, str]:
-    """The longest control step that the moves and the `control_rate` allow, and what limits it."""
+def _steps_of_moves(horizon: float, moves: list[Move]) -> tuple[int, str]:
+    """The smallest number of control steps that the moves allow, and what limits it."""
     slowest = min(moves, key=_longest)
     wanted, across = _longest(slowest), slowest.across
     steps = next((steps for steps in STEPS if horizon / steps <= wanted), STEPS[-1])
-    asked = held * horizon**2 / HELD  # the number of control steps that holding the control asks for
-    if asked > steps:
-        steps = next((short for short in SHORT_STEPS if short >= asked), SHORT_STEPS[-1])
-        return horizon / steps, "A control that is held for longer reacts too late to the noise."
     if steps == STEPS[0]:
-        limit = ""
-    elif horizon / steps <= wanted:
-        limit = f"Moves across {across} limit the control step."
-    else:
-        limit = f"Moves across {across} ask for {wanted:.2g} s, but more than {STEPS[-1]} steps are not proposed."
-    return horizon / steps, limit
+        return steps, ""
+    if horizon / steps <= wanted:
+        return steps, f"Moves across {across} limit the control step."
+    return steps, f"Moves across {across} ask for {wanted:.2g} s, but more than {STEPS[-1]} steps are not proposed."
+
+
+def _lost(problem: ReachAvoidProblem, dt: float, substeps: int, x: Tensor, u: Tensor) -> float:
+    """The mean success that is lost by holding controls for dt, to which it is proportional, and 0 where it is unknown.
+
+    It is measured on a grid. Noise that depends on the control has a part in it that a grid does not show. Then it is
+    estimated by the `control_rate` at the states x (N, n) and controls u (N, m).
+    """
+    n = problem.states.dim
+    if n not in NODES:
+        return 0.0
+    if has_controlled_noise(problem):
+        return LEAST_SHARE * control_rate(problem, x, u) * dt * problem.horizon
+    try:
+        solution = GridSolver(problem, NODES[n], estimate=False).solve()
+        return loss_of_holding(solution, dt, max(1, substeps // 2)).mean
+    except (ArgumentError, ProblemError):  # No node meets the target, or there is no state outside A and B.
+        return 0.0
 
 
 def _substeps(problem: ReachAvoidProblem, dt: float, crossing: Crossing, rate: float, x: Tensor, u: Tensor) -> int:

@@ -16,7 +16,7 @@ from pirl_rl.problems import Reach1D, Safety1D, ZermeloBoat
 from pirl_rl.rates import across_box, across_sets, control_rate, fastest_rate
 from pirl_rl.sets import Box
 from pirl_rl.simulator import Simulator
-from pirl_rl.time_steps import HELD, STEPS, TOLERANCE, propose_time_steps
+from pirl_rl.time_steps import LEAST_SHARE, LOST, STEPS, TOLERANCE, propose_time_steps
 
 
 class Linear(ReachAvoidProblem):
@@ -156,31 +156,57 @@ def test_the_control_rate_has_drift_and_noise_of_one_coordinate(noise, rate):
     assert control_rate(problem, x, u) == pytest.approx(rate)
 
 
+class Shaken(Driven):
+    """The control changes the noise of the second coordinate, too, where nothing is at stake."""
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return super().diffusion(x, u) + torch.diag_embed(torch.cat([0 * u, 0.1 * u], -1))
+
+
 @pytest.mark.parametrize(("speed", "steps"), [(0.9, 400), (1.1, 800), (1.9, 800), (2.1, 1_600), (9.0, 1_600)])
-def test_noise_that_meets_a_strong_control_asks_for_short_steps(speed, steps):
+def test_noise_that_depends_on_the_control_and_meets_a_strong_one_asks_for_short_steps(speed, steps):
     """A noise of 1.7 moves a tenth of the box in 1/72 s, so that the control alone limits the step."""
-    limit = HELD * 400 / (1.7**2 / 4) * 2
-    found = propose_time_steps(Driven((1.7, 0.0), speed * limit))
+    limit = LOST / LEAST_SHARE * 400 / (1.7**2 / 4) * 2
+    found = propose_time_steps(Shaken((1.7, 0.0), speed * limit))
     assert found.dt == pytest.approx(1 / steps)
     assert found.substeps == (1 if steps == 1_600 else 2)
-    assert ("reacts too late" in found.reason) == (steps > 400)
+    assert ("Holding the control" in found.reason) == (steps > 400)
 
 
-def test_with_many_states_control_steps_stay_long():
-    class Many(Driven):
-        def __init__(self):
-            super().__init__((1.7, 0.0), 9.0)
-            self.states = Box([-1.0] * 4, [1.0] * 4)
+class Kept(Safety1D):
+    """Stay in |x| < 1 with a speed of at most `speed`, with two states or more in |x| < 1 and |y| < 3, ..."""
 
-        def drift(self, x: Tensor, u: Tensor) -> Tensor:
-            return torch.cat([self.speed * u, 0 * x[..., 1:]], -1)
+    def __init__(self, speed: float, dim: int = 1):
+        super().__init__()
+        self.speed = speed
+        self.states = Box([-1.0, *[-3.0] * (dim - 1)], [1.0, *[3.0] * (dim - 1)])
 
-        def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
-            return (1.7 * torch.eye(4).to(x)).expand(*x.shape, 4)
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.cat([self.speed * u, 0 * x[..., 1:]], -1)
 
-    problem = Many()
-    assert control_rate(problem, *sampled(problem)) > 100 * HELD
-    assert propose_time_steps(problem).dt == 1 / 400
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.eye(x.shape[-1]).to(x).expand(*x.shape, x.shape[-1])
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        return torch.stack([1.0 - x[..., 0], 1.0 + x[..., 0]], -1)
+
+
+@pytest.mark.parametrize(("horizon", "steps"), [(2.0, 400), (4.0, 800), (12.0, 1_600)])
+def test_a_control_that_must_not_be_held_for_long_asks_for_short_steps(horizon, steps):
+    """Holding loses more where the horizon is longer: about 0.0013, 0.0035 and 0.007 with 400 steps."""
+    problem = Kept(1.0)
+    problem.horizon = horizon
+    found = propose_time_steps(problem)
+    assert found.dt == pytest.approx(horizon / steps)
+    assert found.substeps == (1 if steps == 1_600 else 2)
+    assert ("Holding the control" in found.reason) == (steps > 400)
+
+
+@pytest.mark.parametrize(("dim", "steps"), [(2, 800), (3, 400)])
+def test_with_many_states_control_steps_stay_long(dim, steps):
+    problem = Kept(1.0, dim)
+    problem.horizon = 4.0
+    assert propose_time_steps(problem).dt == 4.0 / steps
 
 
 def test_a_slow_system_has_the_longest_steps():
