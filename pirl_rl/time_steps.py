@@ -1,11 +1,11 @@
-"""Control interval and integration steps of a problem, chosen from its own rates, see `pirl_rl.rates`.
+"""Control interval and integration steps, chosen from a problem's own rates and from what holding a control costs.
 
 A control is held during a control step, so that in one step a path should neither cross much of the box of states nor
 pass through a set, nor should the noise carry it far across a surface where the best control jumps. The control step is
-the longest for which the moves of drift and noise, and the success that holding the control costs, are below the bounds
-that stand here. Up to two states this success is measured on a grid, see `pirl_rl.grid.held`. Within a control step the
-drift is integrated in sub-steps. They resolve its fastest rate, and they are halved until a control step without noise
-is that of ten times as many.
+the longest for which the moves of drift and noise (`pirl_rl.rates`) and the success that holding the control costs are
+below the bounds that stand here. Up to two states this success is measured on a grid, see `pirl_rl.grid.held`. Within a
+control step the drift is integrated in sub-steps. They resolve its fastest rate, and they are halved until a control
+step without noise is that of ten times as many.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """The success that a policy loses because it holds each control for a control step.
 
-A path that plays u where u* is the best control loses V at the rate (f(x, u*) - f(x, u)) . grad V, the difference of the
-Hamiltonians in the HJB equation. The mean of what it loses over the horizon is the difference of the values of both
-policies (S. Kakade and J. Langford, ICML 2002, Lemma 6.1). It needs far fewer paths than the difference of their
-frequencies of success. Noise that depends on the control would have a part in the Hamiltonian, too, but the second
-derivatives of V on a grid are too rough for it.
+A path that plays u where u* is the best control loses V at the rate (f(x, u*) - f(x, u)) . grad V, which is the
+difference of the Hamiltonians in the HJB equation. The mean of what it loses over the horizon is the difference of the
+values of both policies (S. Kakade and J. Langford, ICML 2002, Lemma 6.1). It needs far fewer paths than the difference
+of their frequencies of success. Noise that depends on the control would have a part in the Hamiltonian, too, but the
+second derivatives of V on a grid are too rough for it.
 """
 
 from __future__ import annotations
