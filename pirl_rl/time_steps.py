@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from pirl_rl.errors import ArgumentError, ProblemError
-from pirl_rl.grid import GridSolver
-from pirl_rl.grid.held import loss_of_holding
+from pirl_rl.grid.held import NODES, coarse_solution, loss_of_holding
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.rates import Move, across_box, across_sets, control_rate, fastest_rate
 from pirl_rl.simulator import Crossing, Simulator
@@ -38,12 +37,6 @@ large, and more where V is sharp."""
 
 SHORT_STEPS = (800, 1_600)
 """The numbers of control steps in the horizon from which one is taken where holding the control limits it."""
-
-NODES = {1: 201, 2: 81}
-"""The number of nodes along each axis of the grid on which the lost success is measured, by the number of states.
-
-With more states holding the control does not limit the step, see docs/recipe.md.
-"""
 
 TOLERANCE = 1e-3
 """The largest error of a control step without noise, in widths of the box, that is accepted."""
@@ -169,17 +162,16 @@ def _steps_of_moves(horizon: float, moves: list[Move]) -> tuple[int, str]:
 def _lost(problem: ReachAvoidProblem, dt: float, substeps: int, x: Tensor, u: Tensor) -> float:
     """The mean success that is lost by holding controls for dt, to which it is proportional, and 0 where it is unknown.
 
-    It is measured on a grid. Noise that depends on the control has a part in it that a grid does not show. Then it is
-    estimated by the `control_rate` at the states x (N, n) and controls u (N, m).
+    It is measured on a grid. Noise that depends on the control has a part in it that a grid does not show: then it is
+    estimated by the `control_rate` at the states x (N, n) and controls u (N, m). With more than two states it does not
+    limit the control step, see docs/recipe.md.
     """
-    n = problem.states.dim
-    if n not in NODES:
+    if problem.states.dim not in NODES:
         return 0.0
     if has_controlled_noise(problem):
         return LEAST_SHARE * control_rate(problem, x, u) * dt * problem.horizon
     try:
-        solution = GridSolver(problem, NODES[n], estimate=False).solve()
-        return loss_of_holding(solution, dt, max(1, substeps // 2)).mean
+        return loss_of_holding(coarse_solution(problem), dt, max(1, substeps // 2)).mean
     except (ArgumentError, ProblemError):  # No node meets the target, or there is no state outside A and B.
         return 0.0
 
