@@ -62,7 +62,24 @@ def test_the_exact_solution_is_solved(problem):
     metrics = metrics_of(evidence)
     assert abs(metrics["value_gap"] - metrics["value_gap_noise"]) < 0.01
     assert metrics["success_random"] < metrics["success_learned"]
+    assert metrics["success_grid"] == pytest.approx(metrics["success_learned"], abs=0.02)
     assert {*metrics} == {*Verdict().meanings(problem())}
+
+
+def test_a_policy_that_a_coarse_grid_beats_is_doubtful():
+    evidence, statements = judged(Known(Exit1D(), policy=lambda tau, x: -Exit1D().optimal_control(tau, x)))
+    assert statements["verdict"] != "solved"
+    assert "The policy of a coarse grid succeeds more often, by 0." in statements["verdict_reason"]
+    metrics = metrics_of(evidence)
+    assert metrics["success_grid"] > metrics["success_learned"] + 0.05
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_grid_is_played_with_one_or_two_states(dim):
+    evidence, _ = judged(Known(HalfSpace(dim=dim)))
+    assert ("success_grid" in metrics_of(evidence)) == (dim == 2)
+    assert ("success_grid" in Verdict().meanings(HalfSpace(dim=dim))) == (dim == 2)
+    assert ("the policy of a coarse grid 0." in "".join(lines_of(evidence))) == (dim == 2)
 
 
 class OutOfReach(HalfSpace):
@@ -127,6 +144,7 @@ GOOD = Measures(
     constant_control=[1.0],
     over_constant=Difference(-0.3, 0.01),
     ahead=Difference(0.0, 0.01),
+    grid=Difference(0.0, 0.01),
     finer=Difference(0.0, 0.01),
     gap=0.02,
     gap_error=0.001,
@@ -151,6 +169,10 @@ GOOD = Measures(
         ({"ahead": Difference(-0.05, 0.01)}, None, ""),
         ({"ahead": Difference(0.05, 0.03)}, None, ""),
         ({"ahead": None}, None, ""),
+        ({"grid": Difference(0.05, 0.01)}, "doubtful", "The policy of a coarse grid succeeds more often, by 0.050."),
+        ({"grid": Difference(-0.05, 0.01)}, None, ""),
+        ({"grid": Difference(0.05, 0.03)}, None, ""),
+        ({"grid": None}, None, ""),
         ({"gap": 0.05}, "doubtful", "V is wrong by 0.047"),
         ({"gap": 0.05, "gap_error": 0.02}, None, ""),
         ({"bias": Difference(-0.03, 0.005)}, "doubtful", "0.030 below Monte Carlo"),

@@ -65,6 +65,7 @@ class Measures:
         constant_control: that control, in SI units.
         over_constant: constant minus the policy, with its error.
         ahead: look-ahead minus the policy; None where it was not played.
+        grid: the policy of a coarse grid minus the policy; None where it was not played.
         finer: success with shorter time steps minus that with those of the training.
         gap: the mean of |V - Monte Carlo|.
         gap_error: the standard error of `gap`.
@@ -87,6 +88,7 @@ class Measures:
     constant_control: list[float]
     over_constant: Difference
     ahead: Difference | None
+    grid: Difference | None
     finer: Difference
     gap: float
     gap_error: float
@@ -167,6 +169,12 @@ def _doubts(m: Measures):
             f"A policy that looks one control step ahead succeeds more often, by {m.ahead.mean:.3f}.",
             (TRAIN_LONGER, "use run.policy(tau, x, lookahead=1)"),
         )
+    if m.grid is not None and m.grid.mean > 0 and m.grid.matters():
+        yield Reason(
+            "doubtful",
+            f"The policy of a coarse grid succeeds more often, by {m.grid.mean:.3f}.",
+            (TRAIN_LONGER,),
+        )
     if m.finer.matters():
         yield Reason(
             "doubtful",
@@ -193,13 +201,15 @@ def describe(m: Measures, reasons: list[Reason]) -> list[str]:
     lines = [f"verdict   {level}: {why}"]
     if len(reasons) > 1:
         lines.append(f"          {' '.join(reason.why for reason in reasons[1:])}")
-    ahead = ""
-    if m.ahead is not None:
-        ahead = f", one step of look-ahead {m.success + m.ahead.mean:.3f} ± {m.ahead.error:.3f}"
+    others = [
+        f", {name} {m.success + other.mean:.3f} ± {other.error:.3f}"
+        for name, other in (("one step of look-ahead", m.ahead), ("the policy of a coarse grid", m.grid))
+        if other is not None
+    ]
     lines.append(f"success   {m.success:.3f} of the policy, 95% interval {m.low:.3f} to {m.high:.3f} at these states")
     lines.append(
         f"beside    random controls {m.random:.3f}, the best constant one, {_numbers(m.constant_control)}, "
-        f"{m.constant:.3f}{ahead}"
+        f"{m.constant:.3f}{''.join(others)}"
     )
     lines.append(
         f"value     mean |V - Monte Carlo| {m.gap:.4f}, of which noise {m.noise:.4f}; with shorter steps "

@@ -16,6 +16,7 @@ from pirl_rl.evaluation.largest_residual import largest_residual
 from pirl_rl.evaluation.monte_carlo import expected_deviation, mean_payoff, wilson_interval
 from pirl_rl.evaluation.other_policies import play_open_loop
 from pirl_rl.grid import GridSolution
+from pirl_rl.grid.held import NODES, coarse_solution
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.initial_states import InitialStates, UniformStates
 from pirl_rl.simulator import Simulator
@@ -47,11 +48,13 @@ class VerdictEvidence:
     def metrics(self) -> dict[str, float]:
         m = self.measures
         ahead = {} if m.ahead is None else {"success_ahead": m.success + m.ahead.mean}
+        grid = {} if m.grid is None else {"success_grid": m.success + m.grid.mean}
         return {
             "success_learned": m.success,
             "success_random": m.random,
             "success_constant": m.constant,
             **ahead,
+            **grid,
             "success_finer": m.success + m.finer.mean,
             "value_gap": m.gap,
             "value_gap_noise": m.noise,
@@ -97,6 +100,7 @@ class Verdict:
 
     def meanings(self, problem: ReachAvoidProblem) -> dict[str, str]:
         where = f"from {self.points:,} states and random times to go, {self.rollouts:,} paths each"
+        with_grid = "success_learned, plus the gain of the policy of a coarse grid."
         return {
             "success_learned": f"The success of the policy {where}.",
             "success_random": "The success of controls that are drawn at random in each control step, from there.",
@@ -104,6 +108,7 @@ class Verdict:
             "box of controls, from there.",
             "success_ahead": "success_learned, plus the gain from looking one control step ahead, which is measured "
             f"from one state in {SHARE}.",
+            **({"success_grid": with_grid} if problem.states.dim in NODES else {}),
             "success_finer": f"success_learned, plus the gain from control steps that are {FINER} times as short, "
             f"which is measured from one state in {SHARE}.",
             "value_gap": "The mean of |V - Monte Carlo| at these states.",
@@ -138,6 +143,8 @@ class Verdict:
             gains = largest_residual(solution, tau, x, along := solution.residual(tau, x), levels) - along
             worst = int(gains.argmax())
             gain = gains[worst].item()
+        coarse = _coarse_grid(solution)
+        grid = None if coarse is None else _difference(play(coarse.policy, max(2, self.rollouts // SHARE)), learned)
         low, high = wilson_interval(learned.mean().item() * self.points * self.rollouts, self.points * self.rollouts)
         return VerdictEvidence(
             Measures(
@@ -149,6 +156,7 @@ class Verdict:
                 constant_control=problem.controls.denormalize(action).tolist(),
                 over_constant=_difference(constant, learned),
                 ahead=ahead,
+                grid=grid,
                 finer=_difference(finely, learned[few]),
                 gap=gap.mean().item(),
                 gap_error=gap.std().item() / len(gap) ** 0.5,
@@ -165,6 +173,16 @@ class Verdict:
                 invariance=problem.objective == "invariance",
             )
         )
+
+
+def _coarse_grid(solution: Solution | GridSolution) -> GridSolution | None:
+    """The solution of a coarse grid; None for a solution that is one, for many states, and where no node meets A."""
+    if isinstance(solution, GridSolution) or solution.problem.states.dim not in NODES:
+        return None
+    try:
+        return coarse_solution(solution.problem)
+    except ArgumentError:
+        return None
 
 
 def _difference(other: Tensor, learned: Tensor) -> Difference:
