@@ -76,6 +76,7 @@ def propose_time_steps(
     samples: int = 1024,
     seed: int = 0,
     crossing: Crossing = "bridge",
+    holding: bool = True,
 ) -> TimeSteps:
     """Choose the control step, which then divides the horizon, and the integration steps of a problem.
 
@@ -86,6 +87,7 @@ def propose_time_steps(
         samples: the number of states in the box, and of controls, half of them vertices, at which rates are measured.
         seed: of the samples.
         crossing: the rule of the simulator, which names the drift of an integration step.
+        holding: whether what holding the control costs limits the control step. Its measurement takes seconds.
 
     Raises:
         ArgumentError: `dt`, `substeps` or `samples` is out of range, or `crossing` is unknown.
@@ -98,7 +100,9 @@ def propose_time_steps(
     if dt is None:
         steps, limit = _steps_of_moves(problem.horizon, moves)
         longest = problem.horizon / steps
-        lost = _lost(problem, longest, _substeps(problem, longest, crossing, rate, x, u), x, u)
+        lost = 0.0
+        if holding:
+            lost = _lost(problem, longest, _substeps(problem, longest, crossing, rate, x, u), x, u)
         if lost > LOST:
             steps = next((short for short in SHORT_STEPS if lost * steps <= LOST * short), SHORT_STEPS[-1])
             limit = f"Holding the control for {longest:.4g} s costs about {lost:.1g} of success."

@@ -200,6 +200,7 @@ def test_a_control_that_must_not_be_held_for_long_asks_for_short_steps(horizon, 
     assert found.dt == pytest.approx(horizon / steps)
     assert found.substeps == (1 if steps == 1_600 else 2)
     assert ("Holding the control" in found.reason) == (steps > 400)
+    assert propose_time_steps(problem, holding=False).dt == pytest.approx(horizon / 400)
 
 
 @pytest.mark.parametrize(("dim", "steps"), [(2, 800), (3, 400)])
