@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from pirl_rl.errors import ArgumentError, ProblemError
-from pirl_rl.grid.held import NODES, coarse_solution, loss_of_holding
+from pirl_rl.grid.coarse import NODES, coarse_solution
+from pirl_rl.grid.held import loss_of_holding
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.rates import Move, across_box, across_sets, control_rate, fastest_rate
 from pirl_rl.simulator import Crossing, Simulator
@@ -32,8 +33,10 @@ LOST = 2e-3
 """The largest mean success lost by holding the control that is accepted."""
 
 LEAST_SHARE = 0.6
-"""The success lost, in `control_rate` times control step and horizon: at least so much on all problems where both are
-large, and more where V is sharp."""
+"""A cautious estimate of the success lost, in units of `control_rate` times control step and horizon.
+
+On three problems whose noise does not depend on the control a grid shows 0.7, 0.9 and 5.8 of them, see docs/recipe.md.
+"""
 
 SHORT_STEPS = (800, 1_600)
 """The numbers of control steps in the horizon from which one is taken where holding the control limits it."""
@@ -174,9 +177,10 @@ def _lost(problem: ReachAvoidProblem, dt: float, substeps: int, x: Tensor, u: Te
         return 0.0
     if has_controlled_noise(problem):
         return LEAST_SHARE * control_rate(problem, x, u) * dt * problem.horizon
+    solution = coarse_solution(problem)
     try:
-        return loss_of_holding(coarse_solution(problem), dt, max(1, substeps // 2)).mean
-    except (ArgumentError, ProblemError):  # No node meets the target, or there is no state outside A and B.
+        return 0.0 if solution is None else loss_of_holding(solution, dt, max(1, substeps // 2)).mean
+    except ProblemError:  # There is no state outside A and B in the box.
         return 0.0
 
 

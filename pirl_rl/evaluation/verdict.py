@@ -16,7 +16,7 @@ from pirl_rl.evaluation.largest_residual import largest_residual
 from pirl_rl.evaluation.monte_carlo import expected_deviation, mean_payoff, wilson_interval
 from pirl_rl.evaluation.other_policies import play_open_loop
 from pirl_rl.grid import GridSolution
-from pirl_rl.grid.held import NODES, coarse_solution
+from pirl_rl.grid.coarse import NODES, coarse_solution
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.initial_states import InitialStates, UniformStates
 from pirl_rl.simulator import Simulator
@@ -143,7 +143,7 @@ class Verdict:
             gains = largest_residual(solution, tau, x, along := solution.residual(tau, x), levels) - along
             worst = int(gains.argmax())
             gain = gains[worst].item()
-        coarse = _coarse_grid(solution)
+        coarse = None if isinstance(solution, GridSolution) else coarse_solution(problem)
         grid = None if coarse is None else _difference(play(coarse.policy, max(2, self.rollouts // SHARE)), learned)
         low, high = wilson_interval(learned.mean().item() * self.points * self.rollouts, self.points * self.rollouts)
         return VerdictEvidence(
@@ -173,16 +173,6 @@ class Verdict:
                 invariance=problem.objective == "invariance",
             )
         )
-
-
-def _coarse_grid(solution: Solution | GridSolution) -> GridSolution | None:
-    """The solution of a coarse grid; None for a solution that is one, for many states, and where no node meets A."""
-    if isinstance(solution, GridSolution) or solution.problem.states.dim not in NODES:
-        return None
-    try:
-        return coarse_solution(solution.problem)
-    except ArgumentError:
-        return None
 
 
 def _difference(other: Tensor, learned: Tensor) -> Difference:

@@ -11,22 +11,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from pirl_rl.grid.mesh import default_margin
 from pirl_rl.grid.solution import GridSolution
-from pirl_rl.grid.solver import GridSolver
-from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.sampling.initial_states import sample_interior
 from pirl_rl.simulator import Simulator
-
-NODES = {1: 201, 2: 81}
-"""The number of nodes along each axis of the grid, by the number of states."""
-
-BEYOND = 0.25
-"""The largest margin of the grid beyond the box of states on each side, in widths of the box."""
 
 STILL = 1e-12
 """The least speed, in node distances per s, by which is divided."""
@@ -37,17 +27,6 @@ class Loss(NamedTuple):
 
     mean: float
     error: float
-
-
-def coarse_solution(problem: ReachAvoidProblem) -> GridSolution:
-    """V and the policy on a grid that is fine enough to say what holding the control costs.
-
-    Raises:
-        ArgumentError: no node is next to the target, or outside A and B.
-    """
-    low, high = np.array(problem.states.low), np.array(problem.states.high)
-    margin = np.minimum(default_margin(problem), BEYOND * (high - low))
-    return GridSolver(problem, NODES[problem.states.dim], margin=margin.tolist(), estimate=False).solve()
 
 
 @torch.no_grad()
