@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 
 from pirl_rl.ascent import Objective
+from pirl_rl.problem import ReachAvoidProblem
+from pirl_rl.rates import fastest_rate, sample_pairs
 from pirl_rl.simulator import midpoint_drift
 from pirl_rl.solution import Solution
 
@@ -25,6 +27,21 @@ LONGEST = 8
 A control step is at most half as long as a set is thick. A path is looked at in the middle and at the end of each
 piece, so that it moves for two control steps between two looks, and does not pass a thin wall unseen.
 """
+
+
+def longest_hold(problem: ReachAvoidProblem, dt: float) -> float:
+    """The longest time in s for which a control is held: `LONGEST` control steps, or less where the drift is fast.
+
+    A step of the midpoint rule is at most as long as the time 1/r of the drift's fastest rate r, see
+    `pirl_rl.rates.fastest_rate`. In a longer one an oscillator would swing back, and what the control changed would
+    count with the wrong sign.
+
+    Args:
+        problem: the physics.
+        dt: the control step, in s.
+    """
+    rate = fastest_rate(problem, *sample_pairs(problem))
+    return min(LONGEST * dt, PIECES / rate) if rate > 0 else LONGEST * dt
 
 
 def held_value(solution: Solution, tau: Tensor, x: Tensor, length: float) -> Objective:

@@ -33,6 +33,26 @@ CONTROLS = 16
 """The number of controls over which the range of the drift is taken at each state."""
 
 
+def sample_pairs(problem: ReachAvoidProblem, count: int = 1024, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """States outside A and B, or of all the box if none are found, and as many controls, half of them vertices.
+
+    Args:
+        problem: the physics.
+        count: the number of states that are drawn in the box.
+        seed: of the draws.
+
+    Returns:
+        States (N, n), of which there are at most `count`, and physical controls (N, m), both in double precision.
+    """
+    rng = torch.Generator().manual_seed(seed)
+    x = problem.states.sample(count, rng, dtype=torch.float64)
+    outside = problem.interior(x)
+    x = x[outside] if outside.any() else x
+    action = 2 * torch.rand(len(x), problem.controls.dim, generator=rng, dtype=x.dtype) - 1
+    action[::2] = action[::2].sign()
+    return x, problem.controls.denormalize(action)
+
+
 class Move(NamedTuple):
     """The rates of paths across something.
 

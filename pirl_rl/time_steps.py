@@ -19,7 +19,7 @@ from pirl_rl.errors import ArgumentError, ProblemError
 from pirl_rl.grid.coarse import NODES, coarse_solution
 from pirl_rl.grid.held import loss_of_holding
 from pirl_rl.problem import ReachAvoidProblem
-from pirl_rl.rates import Move, across_box, across_sets, control_rate, fastest_rate
+from pirl_rl.rates import Move, across_box, across_sets, control_rate, fastest_rate, sample_pairs
 from pirl_rl.simulator import Crossing, Simulator
 from pirl_rl.structure import has_controlled_noise
 
@@ -98,7 +98,7 @@ def propose_time_steps(
     if samples < 1:
         raise ArgumentError(f"samples: expected at least 1, got {samples}")
     check_time_steps(problem, dt, substeps, crossing)
-    x, u = _samples(problem, samples, seed)
+    x, u = sample_pairs(problem, samples, seed)
     moves, rate = [across_box(problem, x, u), *across_sets(problem, x, u)], fastest_rate(problem, x, u)
     if dt is None:
         steps, limit = _steps_of_moves(problem.horizon, moves)
@@ -134,17 +134,6 @@ def check_time_steps(
         ArgumentError: `dt` is not in (0, horizon], `substeps` is below 1, or `crossing` is unknown.
     """
     Simulator(problem, problem.horizon if dt is None else dt, 1 if substeps is None else substeps, crossing)
-
-
-def _samples(problem: ReachAvoidProblem, count: int, seed: int) -> tuple[Tensor, Tensor]:
-    """States outside A and B, or all of the box if none are found, and as many controls; in double precision."""
-    rng = torch.Generator().manual_seed(seed)
-    x = problem.states.sample(count, rng, dtype=torch.float64)
-    outside = problem.interior(x)
-    x = x[outside] if outside.any() else x
-    action = 2 * torch.rand(len(x), problem.controls.dim, generator=rng, dtype=x.dtype) - 1
-    action[::2] = action[::2].sign()
-    return x, problem.controls.denormalize(action)
 
 
 def _longest(move: Move) -> float:

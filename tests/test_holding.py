@@ -122,6 +122,44 @@ def test_a_control_is_held_for_eight_control_steps_at_most():
     assert BestControl(problem, Simulator(problem, 0.003125), steps=1).held == 0
 
 
+class Swing(ReachAvoidProblem):
+    """X1' = 7 X2 and X2' = -7 X1 + u with noise, an oscillator whose matrix has eigenvalues of modulus 7."""
+
+    objective = "invariance"
+    horizon = 100.0
+    states, controls = Box([-1.0, -1.0], [1.0, 1.0]), Box([-1.0], [1.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.stack([7 * x[..., 1], u[..., 0] - 7 * x[..., 0]], -1)
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.full_like(x, 0.1).unsqueeze(-1)
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        return 0.9 - x.abs().amax(-1)
+
+
+def test_a_control_is_held_in_two_steps_that_resolve_the_drift():
+    """A fiftieth of the horizon is 2 s here, and eight control steps are 2 s too; the swing turns in 1/7 s."""
+    problem = Swing()
+    assert BestControl(problem, Simulator(problem, 0.25)).held == pytest.approx(2 / 7, rel=1e-6)
+
+
+def test_a_held_control_of_an_oscillator_counts_with_the_right_sign():
+    """At rest u = 1 pushes X2 up at once, but leads to X2 < 0 after more than half a period of 0.9 s.
+
+    V grows with X2 and bends upwards, so that what the control is worth after it was held takes the place of the
+    tangent.
+    """
+    problem = Swing()
+    solution = Known(problem, lambda x: x)
+    solution.value = lambda tau, x: 0.2 * (4 * x[..., 1]).exp()
+    solution.gradient = lambda tau, x: torch.func.grad(lambda y: solution.value(tau, y).sum())(x)
+    x, tau = torch.zeros(1, 2), torch.ones(1)
+    for length, best in ((BestControl(problem, Simulator(problem, 0.25)).held, 1.0), (0.6, -1.0)):
+        assert best_bounds(held_value(solution, tau, x, length), torch.zeros(1, 1))[0].item() == best
+
+
 def test_a_held_control_follows_a_period():
     """From x = -1.9 a path of -0.4 ends at 1.7, where a valley with its bottom at 1.7 is lowest."""
     solution = Known(Turn(), lambda x: 0.1 * (x - 1.7).square())

@@ -13,7 +13,7 @@ from pirl_rl.action_values import Face, Flow, absorbing_faces, expected_ahead, f
 from pirl_rl.actor_rules.base import ActorRule
 from pirl_rl.ascent import Objective, best_bounds, improved
 from pirl_rl.errors import ArgumentError
-from pirl_rl.holding import LONGEST, held_value
+from pirl_rl.holding import held_value, longest_hold
 from pirl_rl.networks import Critic
 from pirl_rl.operators import masked_mean
 from pirl_rl.problem import ReachAvoidProblem
@@ -104,8 +104,8 @@ class BestControl(ActorRule):
             depend on u, and else `INERTIA`.
         ahead: the length of the step of a cubature away from faces, as a share of the horizon, >= 0. The step is never
             shorter than a control step, so that 0 takes one control step everywhere.
-        hold: the time for which controls are held, as a share of the horizon, >= 0; at most `LONGEST` control steps.
-            With 0 the Hamiltonian is taken everywhere.
+        hold: the time for which controls are held, as a share of the horizon, >= 0; at most that of
+            `pirl_rl.holding.longest_hold`. With 0 the Hamiltonian is taken everywhere.
 
     Raises:
         ArgumentError: `steps`, `inertia`, `ahead` or `hold` is below 0, `levels` below 2, or `budget` below 1.
@@ -140,7 +140,7 @@ class BestControl(ActorRule):
         self.flow: Flow = simulator.flow
         affine = levels == 2 and not self.controlled_noise and is_control_affine(problem)
         holds = affine and steps == 0 and m <= MOST_HELD
-        self.held = min(hold * problem.horizon, LONGEST * simulator.dt) if holds else 0.0
+        self.held = min(hold * problem.horizon, longest_hold(problem, simulator.dt)) if holds else 0.0
 
     def __call__(self, solution: Solution, replay: TensorDictBase, points: TensorDictBase) -> Tensor:
         actor, choice = solution.actor, solution.actor.choice
