@@ -28,20 +28,25 @@ A control step is at most half as long as a set is thick. A path is looked at in
 piece, so that it moves for two control steps between two looks, and does not pass a thin wall unseen.
 """
 
+TURN = 0.5
+"""The longest time for which a control is held, times the drift's fastest rate."""
+
 
 def longest_hold(problem: ReachAvoidProblem, dt: float) -> float:
-    """The longest time in s for which a control is held: `LONGEST` control steps, or less where the drift is fast.
+    """The longest time in s for which a control is held: `LONGEST` control steps, or less where the drift turns fast.
 
-    A step of the midpoint rule is at most as long as the time 1/r of the drift's fastest rate r, see
-    `pirl_rl.rates.fastest_rate`. In a longer one an oscillator would swing back, and what the control changed would
-    count with the wrong sign.
+    A control that is best for a while is best in the middle of this while. With the drift's fastest rate r, see
+    `pirl_rl.rates.fastest_rate`, an oscillator's state turns by r/2 times the while until then, and so does the best
+    control. The bound `TURN` keeps this angle below a quarter. Where less than a control step is left, no control is
+    held, and the time is 0.
 
     Args:
         problem: the physics.
         dt: the control step, in s.
     """
     rate = fastest_rate(problem, *sample_pairs(problem))
-    return min(LONGEST * dt, PIECES / rate) if rate > 0 else LONGEST * dt
+    longest = min(LONGEST * dt, TURN / rate) if rate > 0 else LONGEST * dt
+    return longest if longest >= dt else 0.0
 
 
 def held_value(solution: Solution, tau: Tensor, x: Tensor, length: float) -> Objective:

@@ -139,10 +139,18 @@ class Swing(ReachAvoidProblem):
         return 0.9 - x.abs().amax(-1)
 
 
-def test_a_control_is_held_in_two_steps_that_resolve_the_drift():
-    """A fiftieth of the horizon is 2 s here, and eight control steps are 2 s too; the swing turns in 1/7 s."""
+@pytest.mark.parametrize(
+    ("dt", "held"),
+    [
+        pytest.param(0.25, 0, id="shorter than a control step"),
+        pytest.param(0.05, 0.5 / 7, id="half the time of a turn"),
+        pytest.param(0.005, 0.04, id="eight control steps"),
+    ],
+)
+def test_a_control_is_held_for_less_than_the_drift_takes_to_turn(dt, held):
+    """The swing turns by 1 in 1/7 s, and a fiftieth of the horizon are 2 s."""
     problem = Swing()
-    assert BestControl(problem, Simulator(problem, 0.25)).held == pytest.approx(2 / 7, rel=1e-6)
+    assert BestControl(problem, Simulator(problem, dt)).held == pytest.approx(held, rel=1e-6)
 
 
 def test_a_held_control_of_an_oscillator_counts_with_the_right_sign():
@@ -156,7 +164,7 @@ def test_a_held_control_of_an_oscillator_counts_with_the_right_sign():
     solution.value = lambda tau, x: 0.2 * (4 * x[..., 1]).exp()
     solution.gradient = lambda tau, x: torch.func.grad(lambda y: solution.value(tau, y).sum())(x)
     x, tau = torch.zeros(1, 2), torch.ones(1)
-    for length, best in ((BestControl(problem, Simulator(problem, 0.25)).held, 1.0), (0.6, -1.0)):
+    for length, best in ((BestControl(problem, Simulator(problem, 0.05)).held, 1.0), (0.6, -1.0)):
         assert best_bounds(held_value(solution, tau, x, length), torch.zeros(1, 1))[0].item() == best
 
 
