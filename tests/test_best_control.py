@@ -154,6 +154,44 @@ def test_the_cubature_is_exact_for_a_quadratic_value():
     assert torch.allclose(found, expected, atol=1e-5)
 
 
+@pytest.mark.parametrize(("channels", "exact"), [([2], True), ([1, 2], True), ([0, 1, 2, 3], False)])
+def test_the_cubature_has_the_fourth_moments_of_few_columns(channels, exact):
+    """E (s W)^4 = 3 s^4 h^2 for one coordinate, with the sum s^2 of the squares of its columns.
+
+    Columns that add up in the same coordinate have cross moments too, which the cubature leaves out. So each column
+    has a coordinate of its own here. Four columns have ends at sqrt(4), and 4 s^4 h^2.
+    """
+
+    class Apart(ReachAvoidProblem):
+        """dx_k = (1 + k + u) dW_k in four dimensions."""
+
+        horizon = 1.0
+        states, controls = Box([-1.0] * 4, [1.0] * 4), Box([-0.5], [0.5])
+
+        def drift(self, x, u):
+            return torch.zeros_like(x)
+
+        def diffusion(self, x, u):
+            return torch.diag_embed(torch.arange(1.0, 5.0).to(x) + u)
+
+        def target_level(self, x):
+            return 100 - x[..., 0]
+
+    class Quartic:
+        def __init__(self, problem):
+            self.problem = problem
+
+        def value(self, tau, x):
+            return x.pow(4).sum(-1)
+
+    problem, h = Apart(), 0.1
+    x, action = torch.zeros(1, 4, dtype=torch.float64), torch.ones(1, 1, dtype=torch.float64)
+    objective = expected_ahead(Quartic(problem), torch.ones(1, dtype=x.dtype), x, [], h, channels)  # type: ignore[arg-type]
+    strength = torch.tensor([1.5, 2.5, 3.5, 4.5], dtype=x.dtype)[channels]
+    expected = 3 * (strength**4).sum() * h**2
+    assert objective(action).item() == pytest.approx(expected.item() * (1 if exact else 4 / 3), rel=1e-9)
+
+
 class Actuators(ReachAvoidProblem):
     """dx_1 = (u_2 + u_3) dt + 0.2 dW_1 and dx_2 = u_1 dt + (0.3 + u_1^2) dW_2 + (0.4 + u_2/2) dW_3.
 
@@ -321,6 +359,30 @@ def test_noise_beside_a_face_is_not_preferred():
     assert torch.allclose(still, noisy, atol=1e-6)
 
 
+def test_noise_that_may_reach_the_layer_at_a_face_counts():
+    """V = 0.6, and falls to 0 in a layer of 0.1 beside B, which two standard deviations of the step reach.
+
+    The exact mean is that over a Gaussian step which stops at B. With ends at one standard deviation noise would cost
+    nothing.
+    """
+
+    class Layer(Straight):
+        def value(self, tau: Tensor, x: Tensor) -> Tensor:
+            return (6 * (1 + x[..., 0])).clamp(0, 0.6)
+
+    x, action = torch.tensor([[-0.75, 0.0]]), torch.ones(1, 1)
+    strength = Channel().diffusion(x, Channel().controls.denormalize(action))[0, 0, 0]
+    h = float((0.125 / strength) ** 2)
+    objective = expected_ahead(Layer(), torch.ones(1), x, absorbing_faces(Channel(), x), h, [0])  # type: ignore[arg-type]
+    lost = 0.6 - objective(action).item()
+    z = torch.linspace(-8, 8, 160_001, dtype=torch.float64)
+    distance = 0.25 + 0.125 * z
+    value = (6 * distance).clamp(-0.6, 0.6)
+    exact = 0.6 - torch.trapezoid(value * (-z.square() / 2).exp() / math.sqrt(2 * math.pi), z).item()
+    assert 0.03 < exact < 0.05
+    assert exact / 2 < lost < 2 * exact
+
+
 def test_a_free_step_goes_half_way_to_the_faces():
     """Two channels of strength 1, which h moves by sqrt(2 h), and levels of any slope; see `free_step`."""
     x = Channel().states.sample(200, torch.Generator().manual_seed(3))
@@ -381,8 +443,8 @@ def test_several_actions_at_once_have_the_values_of_each_of_them_beside_faces(cr
             share = time_to_exit(level(x), -(slope * drift).sum(-1), spread, torch.full_like(tau, h))
             duration = torch.minimum(duration, h * share)
         mean = x + duration.unsqueeze(-1) * drift
-        ends = [mean + side * math.sqrt(2 * h) * sigma[..., k] for k in range(2) for side in (1, -1)]
-        expected = torch.stack([continued_value(solution, tau - h, end) for end in ends]).mean(0)
+        ends = [mean + side * math.sqrt(3 * h) * sigma[..., k] for k in range(2) for side in (1, -1)]
+        expected = torch.stack([continued_value(solution, tau - h, end) for end in (*ends, mean, mean)]).mean(0)
         assert torch.allclose(found[i, j], expected, atol=1e-6)
         assert torch.allclose(objective(actions[i, j]), expected, atol=1e-6)
     with pytest.raises(ArgumentError, match=r"x: expected states \(N, n\) and times to go \(N,\), got \(4, 7, 2\)"):
