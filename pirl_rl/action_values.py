@@ -30,8 +30,8 @@ TINY = torch.finfo(torch.float32).tiny
 FAR = 3.0
 """The distance from a face, in sqrt(2 h) times the noise across it, from which paths hardly meet it within h."""
 
-LEAST_FAR = 3
-"""The least square of the distance of the ends of a cubature, in standard deviations of the noise of one column."""
+NEAR_B = 3
+"""c for one and two columns beside B, the square of the distance of the ends of a cubature in standard deviations."""
 
 CHUNK_ENTRIES = 2**26
 """The largest number of entries of sigma, over all points and actions, that are in memory at once."""
@@ -75,18 +75,19 @@ def _bend(problem: ReachAvoidProblem, x: Tensor, u: Tensor, curvature: Tensor) -
 
 
 class Face(NamedTuple):
-    """The level g (N,) of a set that absorbs, with its gradient (N, n), at states (N, n)."""
+    """The level g (N,) of a set that absorbs, with its gradient (N, n), at states (N, n), and whether the set is B."""
 
     level: Tensor
     slope: Tensor
+    fails: bool
 
 
 def absorbing_faces(problem: ReachAvoidProblem, x: Tensor) -> list[Face]:
     """The levels of A and B, as far as they absorb, at states x (N, n)."""
-    levels = [problem.scaled_avoid_level] if problem.has_avoid_set else []
+    levels = [(problem.scaled_avoid_level, True)] if problem.has_avoid_set else []
     if problem.objective == "reach-avoid":
-        levels.append(problem.scaled_reached_level)
-    return [Face(level(x), torch.func.grad(lambda y, level=level: level(y).sum())(x)) for level in levels]
+        levels.append((problem.scaled_reached_level, False))
+    return [Face(level(x), torch.func.grad(lambda y, level=level: level(y).sum())(x), fails) for level, fails in levels]
 
 
 def free_step(
@@ -99,10 +100,10 @@ def free_step(
 ) -> Tensor:
     """The length (N,) in s, between two bounds, of an Euler step whose noise goes at most half way to A and to B.
 
-    With s = |sigma^T grad g| for the level g of a set, points at +- sqrt(w h) sigma_k move g by at most s sqrt(w h) to
-    first order, so that h = g^2 / (4 w s^2). Those of `expected_ahead` for one and two columns lie farther, and go up
-    to 0.87 and 0.61 of the way. The noise is the strongest of several controls: two opposite corners and the center of
-    the box of controls, and the bounds of each coordinate with the others in the middle.
+    The ends of the cubature of `expected_ahead` are at +- sqrt(w h) sigma_k, except beside B. With s = |sigma^T grad g|
+    for the level g of a set, they move g by at most s sqrt(w h) to first order, so that h = g^2 / (4 w s^2). The noise
+    is the strongest of several controls: two opposite corners and the center of the box of controls, and the bounds of
+    each coordinate with the others in the middle.
 
     Args:
         problem: the physics.
@@ -118,7 +119,7 @@ def free_step(
     u = problem.controls.denormalize(actions.unsqueeze(1).expand(-1, len(x), m))
     sigma = problem.diffusion(x.expand(len(u), -1, -1), u)[..., list(channels)].nan_to_num(0.0)
     length = torch.full_like(x[:, 0], longest)
-    for level, slope in faces:
+    for level, slope, _ in faces:
         free = level.square() / (4 * len(channels) * _spread(slope, sigma).amax(0)).clamp(min=TINY)
         length = torch.minimum(length, free.nan_to_num(0.0))  # a level without a number may be that of a near face
     return length.clamp(min=shortest)
@@ -156,10 +157,10 @@ def expected_ahead(
 ) -> Objective:
     """E V (*, N) after one Euler step with the action (*, N, m), by a cubature, Eq. (cubature).
 
-    For w columns of sigma the ends lie at y +- sqrt(c h) sigma_k with y = x + f r h and c = max(w, `LEAST_FAR`), and y
-    itself has the weight 1 - w/c. They have the mean and the covariance of a step that ends in A and B, and along each
-    of up to three columns its fourth moment too. The ends of one or two columns lie at 1.7 standard deviations of the
-    noise. Nearer ones would not see how steeply V falls beside B.
+    For w columns of sigma the ends lie at y +- sqrt(c h) sigma_k with y = x + f r h, and have the mean and the
+    covariance of a step that ends in A and B. In general c = w. With one or two columns c = `NEAR_B` where the ends
+    would then go more than half way to B, and y itself has the weight 1 - w/c: nearer ends would not see how steeply V
+    falls beside B.
 
     The mean is bounded where a second derivative is not: next to a face V may change within one step, and there the
     learned curvature may be of any size and sign. V is continued into A and B, see `continued_value`, which takes care
@@ -176,23 +177,26 @@ def expected_ahead(
             action adds the same to all actions, to first order in h, and may be left out.
     """
     problem, h = solution.problem, tau.clamp(max=length)
-    w, far = len(channels), max(len(channels), LEAST_FAR)
+    w = len(channels)
+    beside = w < NEAR_B and any(face.fails for face in faces)
 
     def value(action: Tensor) -> Tensor:
         u, shape = problem.controls.denormalize(action), action.shape[:-1]
         y = x.expand(*shape, -1)
         drift, diffusion = problem.drift(y, u), problem.diffusion(y, u)
-        duration = h.expand(shape)
-        for level, slope in faces:
-            share = time_to_exit(level, -(slope * drift).sum(-1), _spread(slope, diffusion), h)
+        duration, far = h.expand(shape), torch.full_like(h.expand(shape), w)
+        for level, slope, fails in faces:
+            spread = _spread(slope, diffusion)
+            share = time_to_exit(level, -(slope * drift).sum(-1), spread, h)
             duration = torch.minimum(duration, share * h)
-        columns = diffusion.movedim(-1, 0)
-        spread = torch.stack([columns[k] for k in channels]) * (far * h).sqrt().unsqueeze(-1)
-        middle = (y + drift * duration.unsqueeze(-1)).unsqueeze(0)
-        ends = torch.cat([middle + spread, middle - spread, *([middle] if w < far else [])])
+            if fails and beside:
+                far = torch.where(level.square() < 4 * NEAR_B * h * spread, NEAR_B, far)
+        columns, middle = diffusion.movedim(-1, 0), (y + drift * duration.unsqueeze(-1)).unsqueeze(0)
+        moves = torch.stack([columns[k] for k in channels]) * (far * h).sqrt().unsqueeze(-1)
+        ends = torch.cat([middle + moves, middle - moves, *([middle] if beside else [])])
         values = continued_value(solution, (tau - h).expand(ends.shape[:-1]), ends)
         outer = values[: 2 * w].sum(0) / (2 * far)
-        return outer + (1 - w / far) * values[2 * w] if w < far else outer
+        return outer + (1 - w / far) * values[2 * w] if beside else outer
 
     return value
 

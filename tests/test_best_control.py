@@ -13,6 +13,7 @@ from torch import Tensor
 from benchmarks.kinds import Bicycle, Gusty, Investor, Loiter, Sprint, TwoHarbours
 from pirl_rl import Box, ReachAvoidProblem, action_values
 from pirl_rl.action_values import (
+    Face,
     absorbing_faces,
     continued_value,
     expected_ahead,
@@ -154,12 +155,12 @@ def test_the_cubature_is_exact_for_a_quadratic_value():
     assert torch.allclose(found, expected, atol=1e-5)
 
 
-@pytest.mark.parametrize(("channels", "exact"), [([2], True), ([1, 2], True), ([0, 1, 2, 3], False)])
-def test_the_cubature_has_the_fourth_moments_of_few_columns(channels, exact):
-    """E (s W)^4 = 3 s^4 h^2 for one coordinate, with the sum s^2 of the squares of its columns.
+@pytest.mark.parametrize("channels", [[2], [1, 2], [0, 1, 2], [0, 1, 2, 3]])
+@pytest.mark.parametrize("near", [False, True])
+def test_the_cubature_has_the_fourth_moments_of_few_columns_beside_the_avoid_set(channels, near):
+    """E (s W)^4 = 3 s^4 h^2 for each coordinate, which has a column of its own, of strength s.
 
-    Columns that add up in the same coordinate have cross moments too, which the cubature leaves out. So each column
-    has a coordinate of its own here. Four columns have ends at sqrt(4), and 4 s^4 h^2.
+    Points at +- sqrt(c h) have c s^4 h^2, with c = 3 beside B for one and two columns, and else c = w.
     """
 
     class Apart(ReachAvoidProblem):
@@ -186,10 +187,12 @@ def test_the_cubature_has_the_fourth_moments_of_few_columns(channels, exact):
 
     problem, h = Apart(), 0.1
     x, action = torch.zeros(1, 4, dtype=torch.float64), torch.ones(1, 1, dtype=torch.float64)
-    objective = expected_ahead(Quartic(problem), torch.ones(1, dtype=x.dtype), x, [], h, channels)  # type: ignore[arg-type]
+    slope = torch.tensor([[0.0, 0.0, 1.0, 0.0]], dtype=x.dtype)
+    faces = [Face(torch.tensor([0.5 if near else 50.0], dtype=x.dtype), slope, True)]
+    objective = expected_ahead(Quartic(problem), torch.ones(1, dtype=x.dtype), x, faces, h, channels)  # type: ignore[arg-type]
     strength = torch.tensor([1.5, 2.5, 3.5, 4.5], dtype=x.dtype)[channels]
-    expected = 3 * (strength**4).sum() * h**2
-    assert objective(action).item() == pytest.approx(expected.item() * (1 if exact else 4 / 3), rel=1e-9)
+    far = max(3, len(channels)) if near else len(channels)
+    assert objective(action).item() == pytest.approx(far * (strength**4).sum().item() * h**2, rel=1e-9)
 
 
 class Actuators(ReachAvoidProblem):
@@ -437,14 +440,24 @@ def test_several_actions_at_once_have_the_values_of_each_of_them_beside_faces(cr
     found, u, h = objective(actions), problem.controls.denormalize(actions), 0.05
     for i, j in itertools.product(range(3), range(2)):
         drift, sigma, duration = problem.drift(x, u[i, j]), problem.diffusion(x, u[i, j]), torch.full_like(tau, h)
+        far = torch.full_like(tau, 2.0)
         for level in (problem.avoid_level, problem.target_level):
             slope = torch.func.grad(lambda y, level=level: level(y).sum())(x)
             spread = torch.einsum("ni,nik->nk", slope, sigma).square().sum(-1)
             share = time_to_exit(level(x), -(slope * drift).sum(-1), spread, torch.full_like(tau, h))
             duration = torch.minimum(duration, h * share)
+            if level == problem.avoid_level:
+                far[level(x) < 2 * (3 * h * spread).sqrt()] = 3.0
         mean = x + duration.unsqueeze(-1) * drift
-        ends = [mean + side * math.sqrt(3 * h) * sigma[..., k] for k in range(2) for side in (1, -1)]
-        expected = torch.stack([continued_value(solution, tau - h, end) for end in (*ends, mean, mean)]).mean(0)
+        reach = (far * h).sqrt().unsqueeze(-1)
+        ends = torch.stack(
+            [
+                continued_value(solution, tau - h, mean + side * reach * sigma[..., k])
+                for k in range(2)
+                for side in (1, -1)
+            ]
+        )
+        expected = ends.sum(0) / (2 * far) + (1 - 2 / far) * continued_value(solution, tau - h, mean)
         assert torch.allclose(found[i, j], expected, atol=1e-6)
         assert torch.allclose(objective(actions[i, j]), expected, atol=1e-6)
     with pytest.raises(ArgumentError, match=r"x: expected states \(N, n\) and times to go \(N,\), got \(4, 7, 2\)"):
