@@ -35,10 +35,10 @@ TURN = 0.5
 def longest_hold(problem: ReachAvoidProblem, dt: float) -> float:
     """The longest time in s for which a control is held: `LONGEST` control steps, or less where the drift turns fast.
 
-    A control that is best for a while is best in the middle of this while. With the drift's fastest rate r, see
-    `pirl_rl.rates.fastest_rate`, an oscillator's state turns by r/2 times the while until then, and so does the best
-    control. The bound `TURN` keeps this angle below a quarter. Where less than a control step is left, no control is
-    held, and the time is 0.
+    A control that is best for a time t is best in the middle of this time. With the drift's fastest rate r, see
+    `pirl_rl.rates.fastest_rate`, an oscillator turns by the angle r t/2 until then, and so does its best control. With
+    r t at most `TURN` this angle is at most a quarter of a radian. Where that is less than a control step, no control
+    is held, and the time is 0.
 
     Args:
         problem: the physics.
