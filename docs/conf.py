@@ -122,6 +122,7 @@ reference_rooms = {
             "pirl_rl.actor_rules.best_control",
             "pirl_rl.ascent",
             "pirl_rl.action_values",
+            "pirl_rl.cubature",
             "pirl_rl.actor_rules.clipped_surrogate",
             "pirl_rl.actor_rules.sum",
         ],

@@ -16,7 +16,7 @@ from torch import Tensor
 Objective = Callable[[Tensor], Tensor]
 """Maps actions (N, m), normalised to [-1, 1], to numbers (N,), each of which depends on its own action alone.
 
-Those of `pirl_rl.action_values` map actions (*, N, m) to numbers (*, N)."""
+Those of `pirl_rl.action_values` and `pirl_rl.cubature` map actions (*, N, m) to numbers (*, N)."""
 
 
 def ascend(objective: Objective, action: Tensor, levels: Tensor, sweeps: int = 1) -> tuple[Tensor, Tensor]:

@@ -12,22 +12,14 @@ from torch import Tensor
 
 from benchmarks.kinds import Bicycle, Gusty, Investor, Loiter, Sprint, TwoHarbours
 from pirl_rl import Box, ReachAvoidProblem, action_values
-from pirl_rl.action_values import (
-    Face,
-    absorbing_faces,
-    continued_value,
-    expected_ahead,
-    free_step,
-    hamiltonian,
-    time_to_exit,
-    value_ahead,
-)
+from pirl_rl.action_values import hamiltonian, value_ahead
 from pirl_rl.actor_rules import BestControl, Hamiltonian
 from pirl_rl.ascent import ascend, improved
 from pirl_rl.assembly import make_trainer
 from pirl_rl.automatic import choose_actor
 from pirl_rl.building import build
 from pirl_rl.commands.composition import compose
+from pirl_rl.cubature import Face, absorbing_faces, continued_value, expected_ahead, free_step, time_to_exit
 from pirl_rl.errors import ArgumentError, ConfigError
 from pirl_rl.layers import LogLevels
 from pirl_rl.networks import Actor, Critic, stack

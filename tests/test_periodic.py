@@ -11,7 +11,7 @@ from oracles import Circle, FullNoise, Winding, name, points, random_solution
 
 import pirl_rl
 from pirl_rl import ReachAvoidProblem
-from pirl_rl.action_values import continued_value
+from pirl_rl.cubature import continued_value
 from pirl_rl.evaluation.monte_carlo import monte_carlo
 from pirl_rl.evaluation.trajectories import closed_loop
 from pirl_rl.layers import Periodic

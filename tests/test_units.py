@@ -7,7 +7,7 @@ import torch
 
 import pirl_rl
 from pirl_rl import Box, ReachAvoidProblem
-from pirl_rl.action_values import absorbing_faces, continued_value, free_step
+from pirl_rl.cubature import absorbing_faces, continued_value, free_step
 from pirl_rl.layers import LogLevels
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.problems import DoubleIntegrator

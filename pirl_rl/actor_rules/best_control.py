@@ -9,9 +9,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from pirl_rl.action_values import Face, Flow, absorbing_faces, expected_ahead, free_step, hamiltonian, value_ahead
+from pirl_rl.action_values import Flow, hamiltonian, value_ahead
 from pirl_rl.actor_rules.base import ActorRule
 from pirl_rl.ascent import Objective, best_bounds, improved
+from pirl_rl.cubature import Face, absorbing_faces, expected_ahead, free_step
 from pirl_rl.errors import ArgumentError
 from pirl_rl.holding import held_value, longest_hold
 from pirl_rl.networks import Critic
@@ -64,10 +65,10 @@ class BestControl(ActorRule):
     together, j is the best of all combinations of their levels, and w_i the range of the Hamiltonian over these.
 
     For the coordinates of u on which sigma depends, E V after one step takes the place of the Hamiltonian, divided by
-    the length of the step, see `pirl_rl.action_values.expected_ahead`: next to faces the Hessian of a network may have
+    the length of the step, see `pirl_rl.cubature.expected_ahead`: next to faces the Hessian of a network may have
     the wrong sign. Away from faces the step is longer than a control step, because the second derivatives of a network
     have ripples, over which a longer step takes the mean. Next to faces it is as short as a control step, see
-    `pirl_rl.action_values.free_step`. The step has the noise of those channels that depend on the coordinate.
+    `pirl_rl.cubature.free_step`. The step has the noise of those channels that depend on the coordinate.
     Coordinates on which the same channels depend take their best levels at once, one block of them after the other.
     With more noise channels times controls than `MOST_PAIRS` the step would be too dear, and the Hamiltonian stays.
 
