@@ -7,6 +7,7 @@ from benchmarks.kinds.demands import Backburn, ChemoWard, IslandGrid, VaccineSto
 from benchmarks.kinds.flights import Descent, Encounter
 from benchmarks.kinds.journeys import Barge, Scooter, SolarCar
 from benchmarks.kinds.lines import Casino, Gene, Tightrope, Uphill, Washboard
+from benchmarks.kinds.machines import Converter, Detumble, Friction, MagLev
 from benchmarks.kinds.markets import Endowment, Granary, PairTrade
 from benchmarks.kinds.masses import Crosswind, Gusty, Lander, Orbit, Servo, Sprint, VanDerPol
 from benchmarks.kinds.mixtures import Bearing, Mirror, Mixture
@@ -17,6 +18,7 @@ from benchmarks.kinds.stores import Chemostat, FastCharge, Ferment, Fishery, For
 from benchmarks.kinds.swings import Duffing, LongWatch, MountainCar, QuietStance, Swingup
 from benchmarks.kinds.vehicles import Bicycle, Evader, Loiter, Ring, River, Slalom, Steering, TwoCars, TwoHarbours
 from benchmarks.kinds.waters import Convection, Drawbridge, Fjord, Levee, Minefield
+from benchmarks.kinds.weather import Drone3, Hedge, Interceptor, Storm, Tide
 from pirl_rl import ReachAvoidProblem
 
 __all__ = ["KINDS", "PROBLEMS", "Mixture"]
@@ -30,5 +32,6 @@ KINDS += (VaccineStock, Backburn, ChemoWard, IslandGrid, StraitFerry, QuietStanc
 KINDS += (TackingYacht, Encounter, Descent, Gantry, Endowment, Granary, PairTrade, Chemostat)
 KINDS += (SolarCar, Scooter, Barge, Tightrope, Casino, Washboard, Uphill, Gene)
 KINDS += (Fjord, Drawbridge, Levee, Convection, Minefield, Flywheels, LongWatch, TwoDoors)
+KINDS += (Friction, Converter, Storm, Interceptor, Hedge, MagLev, Detumble, Tide, Drone3)
 
 PROBLEMS = {kind.__name__: kind for kind in KINDS} | OTHERS
