@@ -93,8 +93,7 @@ def value_ahead(
         ahead = solution.value(t, y).reshape(shape)
         if curvature is None:
             return ahead
-        sigma, length = problem.diffusion(x.expand(*shape, -1), u), tau.clamp(max=simulator.dt)
-        return ahead + length * (sigma * (curvature @ sigma)).sum((-2, -1)) / 2
+        return ahead + tau.clamp(max=simulator.dt) * _bend(problem, x.expand(*shape, -1), u, curvature)
 
     return value
 

@@ -1,6 +1,6 @@
 """Problems of other kinds than those of the suite, written as a user would, and the suite's with other constants."""
 
-from benchmarks.kinds.approaches import Chain, Gantry, Pursuit, Rendezvous, Unicycle
+from benchmarks.kinds.approaches import Chain, Gantry, Interceptor, Pursuit, Rendezvous, Unicycle
 from benchmarks.kinds.compartments import Anaesthesia, HerdImmunity, LotkaVolterra, LynxAndHare, Rooms
 from benchmarks.kinds.cycles import Flywheels, JetLag, PowerSwing, Runaway, Searchlight
 from benchmarks.kinds.demands import Backburn, ChemoWard, IslandGrid, VaccineStock
@@ -8,7 +8,7 @@ from benchmarks.kinds.flights import Descent, Encounter
 from benchmarks.kinds.journeys import Barge, Scooter, SolarCar
 from benchmarks.kinds.lines import Casino, Gene, Tightrope, Uphill, Washboard
 from benchmarks.kinds.machines import Converter, Detumble, Friction, MagLev
-from benchmarks.kinds.markets import Endowment, Granary, PairTrade
+from benchmarks.kinds.markets import Endowment, Granary, Hedge, PairTrade
 from benchmarks.kinds.masses import Crosswind, Gusty, Lander, Orbit, Servo, Sprint, VanDerPol
 from benchmarks.kinds.mixtures import Bearing, Mirror, Mixture
 from benchmarks.kinds.other_constants import OTHERS
@@ -18,7 +18,7 @@ from benchmarks.kinds.stores import Chemostat, FastCharge, Ferment, Fishery, For
 from benchmarks.kinds.swings import Duffing, LongWatch, MountainCar, QuietStance, Swingup
 from benchmarks.kinds.vehicles import Bicycle, Evader, Loiter, Ring, River, Slalom, Steering, TwoCars, TwoHarbours
 from benchmarks.kinds.waters import Convection, Drawbridge, Fjord, Levee, Minefield
-from benchmarks.kinds.weather import Drone3, Hedge, Interceptor, Storm, Tide
+from benchmarks.kinds.weather import Drone3, Storm, Tide
 from pirl_rl import ReachAvoidProblem
 
 __all__ = ["KINDS", "PROBLEMS", "Mixture"]

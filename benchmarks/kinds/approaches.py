@@ -1,4 +1,4 @@
-"""A pursuer, a unicycle, a spacecraft and two chains of integrators, which have to meet a small set."""
+"""A pursuer, a unicycle, a spacecraft, two chains of integrators and a drifting vessel: to meet a small set."""
 
 from __future__ import annotations
 
@@ -117,3 +117,24 @@ class Gantry(ReachAvoidProblem):
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
         return rows(1 - x[..., 0].abs(), 1.5 - x[..., 1].abs())
+
+
+class Interceptor(ReachAvoidProblem):
+    """Meet a vessel that drifts at random, past a reef, with the heading as control; relative position in km, and h."""
+
+    horizon = 4.0
+    states, controls = Box([-2.0, -2.0], [2.0, 2.0]), Box([-math.pi], [math.pi])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        heading = u[..., 0]
+        return rows(0.7 * torch.cos(heading) - 0.3, 0.7 * torch.sin(heading) + 0.2 * x[..., 0])
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        return constant(x, [0.2, 0.0], [0.0, 0.3])
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return torch.hypot(x[..., 0] - 0.9, x[..., 1] - 0.6) - 0.25
+
+    def avoid_constraints(self, x: Tensor) -> Tensor:
+        reef = torch.maximum((x[..., 0] - 0.2).abs(), (x[..., 1] - 0.3).abs() / 3) - 0.2
+        return rows(reef, 1.9 - x.abs().amax(-1))

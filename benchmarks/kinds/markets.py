@@ -1,4 +1,4 @@
-"""An endowment, a pair of shares and a granary: to gain or to fill something before means are used up."""
+"""An endowment, a pair of shares, a granary and a hedge: to gain or to fill something before means are used up."""
 
 from __future__ import annotations
 
@@ -79,3 +79,29 @@ class PairTrade(ReachAvoidProblem):
 
     def avoid_constraints(self, x: Tensor) -> Tensor:
         return x[..., 1:] - 0.75
+
+
+class Hedge(ReachAvoidProblem):
+    """Reach a wealth of 1.5 before 0.6 within two years, with a stock whose volatility wanders.
+
+    The states are wealth and volatility, whose shocks are correlated. The control is the share of the wealth that is in
+    the stock, up to 2.
+    """
+
+    horizon = 2.0
+    states, controls = Box([0.4, 0.05], [2.0, 0.6]), Box([0.0], [2.0])
+
+    def drift(self, x: Tensor, u: Tensor) -> Tensor:
+        wealth, volatility = x.unbind(-1)
+        return rows(wealth * (0.02 + 0.12 * u[..., 0]), 2 * (0.2 - volatility))
+
+    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
+        wealth, volatility = x.unbind(-1)
+        gain = rows(u[..., 0] * volatility * wealth, torch.zeros_like(wealth))
+        return torch.stack([gain, rows(-0.2 * volatility, 0.25 * volatility)], -2)
+
+    def target_level(self, x: Tensor) -> Tensor:
+        return 1.5 - x[..., 0]
+
+    def avoid_level(self, x: Tensor) -> Tensor:
+        return x[..., 0] - 0.6

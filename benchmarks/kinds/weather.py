@@ -1,4 +1,4 @@
-"""A storm, a tide, a wind that grows with height, a vessel that drifts, a volatile market: noise that leads the way."""
+"""A storm, a tide, and a wind that grows with height: ways that lead through weather."""
 
 from __future__ import annotations
 
@@ -71,50 +71,3 @@ class Drone3(ReachAvoidProblem):
         a, b, height = x.unbind(-1)
         left, right = torch.hypot(a - 1.2, b - 0.25) - 0.3, torch.hypot(a - 1.9, b + 0.6) - 0.25
         return rows(left, right, 0.97 - b.abs(), height - 0.05, 1.45 - height)
-
-
-class Interceptor(ReachAvoidProblem):
-    """Meet a vessel that drifts at random, past a reef, with the heading as control; relative position in km, and h."""
-
-    horizon = 4.0
-    states, controls = Box([-2.0, -2.0], [2.0, 2.0]), Box([-math.pi], [math.pi])
-
-    def drift(self, x: Tensor, u: Tensor) -> Tensor:
-        heading = u[..., 0]
-        return rows(0.7 * torch.cos(heading) - 0.3, 0.7 * torch.sin(heading) + 0.2 * x[..., 0])
-
-    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
-        return constant(x, [0.2, 0.0], [0.0, 0.3])
-
-    def target_level(self, x: Tensor) -> Tensor:
-        return torch.hypot(x[..., 0] - 0.9, x[..., 1] - 0.6) - 0.25
-
-    def avoid_constraints(self, x: Tensor) -> Tensor:
-        reef = torch.maximum((x[..., 0] - 0.2).abs(), (x[..., 1] - 0.3).abs() / 3) - 0.2
-        return rows(reef, 1.9 - x.abs().amax(-1))
-
-
-class Hedge(ReachAvoidProblem):
-    """Reach a wealth of 1.5 before 0.6 within two years, with a stock whose volatility wanders.
-
-    The states are wealth and volatility, whose shocks are correlated. The control is the share of the wealth that is in
-    the stock, up to 2.
-    """
-
-    horizon = 2.0
-    states, controls = Box([0.4, 0.05], [2.0, 0.6]), Box([0.0], [2.0])
-
-    def drift(self, x: Tensor, u: Tensor) -> Tensor:
-        wealth, volatility = x.unbind(-1)
-        return rows(wealth * (0.02 + 0.12 * u[..., 0]), 2 * (0.2 - volatility))
-
-    def diffusion(self, x: Tensor, u: Tensor) -> Tensor:
-        wealth, volatility = x.unbind(-1)
-        gain = rows(u[..., 0] * volatility * wealth, torch.zeros_like(wealth))
-        return torch.stack([gain, rows(-0.2 * volatility, 0.25 * volatility)], -2)
-
-    def target_level(self, x: Tensor) -> Tensor:
-        return 1.5 - x[..., 0]
-
-    def avoid_level(self, x: Tensor) -> Tensor:
-        return x[..., 0] - 0.6
