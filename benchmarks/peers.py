@@ -3,9 +3,10 @@
     python benchmarks/peers.py [--rounds 20] [--updates 50] [--json FILE]
 
 An update draws a batch from the replay buffer, takes a step of Adam for two critics and, every second time, one for the
-actor and one of the target networks. Widths, batch size, and rates are equal. TorchRL's loop is that of its TD3 script:
-`TD3Loss`, `SoftUpdate` and Adam, run eagerly. "matrix products" are those of an update alone, forward and backward,
-without activations, samplers and optimisers: the floor of this machine for everything that runs through torch.
+actor and one of the target networks. Widths, batch size, and rates are equal; widths and batch size are those of the
+paper for each problem. TorchRL's loop is that of its TD3 script: `TD3Loss`, `SoftUpdate` and Adam, run eagerly. "matrix
+products" are those of an update alone, forward and backward, without activations, samplers and optimisers: the floor of
+this machine for everything that runs through torch.
 
 A played step is one control step of one path, with its policy, noise and storage in the replay buffer.
 Stable-Baselines3 plays the Gymnasium view of the same problem: one environment, which is its default, or 64 paths of
@@ -20,6 +21,7 @@ import statistics
 import time
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,10 +43,28 @@ from pirl_rl.gymnasium import ReachAvoidVectorGym
 from pirl_rl.rivals.stable_baselines import Paths
 from pirl_rl.trainer import Trainer
 
-ACTOR, CRITIC, BATCH = (32, 32), (64, 64, 64), 256
-"""The widths of the hidden layers, and the transitions of an update."""
 
-EXPERIMENTS = {"the 1-D problem": "reach1d", "the drifting vehicle": "drift"}
+@dataclass(frozen=True)
+class Case:
+    """A problem with the paper's widths of hidden layers and transitions of an update.
+
+    Attributes:
+        experiment: the name of its experiment.
+        critic: the widths of the hidden layers of the critics.
+        batch: the number of transitions of an update.
+        actor: the widths of the hidden layers of the actor.
+    """
+
+    experiment: str
+    critic: tuple[int, ...]
+    batch: int
+    actor: tuple[int, ...] = (32, 32)
+
+
+CASES = {
+    "the 1-D problem": Case("reach1d", (32, 32, 32), 128),
+    "the drifting vehicle": Case("drift", (64, 64, 64), 256),
+}
 
 OURS = {"updates a second": "pirl_rl", "played steps a second": "pirl_rl, collector"}
 """The rate of ours that the others are compared with; theirs have policy, noise and storage too."""
@@ -54,18 +74,21 @@ SETTINGS = (
     "recipe=any_problem",
     "device=cpu",
     "logger=none",
-    f"actor={{hidden:{[*ACTOR]},activation:ReLU,root_time:false,spread:null,levels:false}}",
-    f"critic={{hidden:{[*CRITIC]},activation:Tanh,output:null,root_time:false,spread:null,levels:false,log_levels:false}}",
     "learner={learning_rate:1e-3,decay:constant,optimizer:adam,polyak:0.005}",
     "collector.control_variate=null",
     "trainer.updates=1000",
-    f"trainer.batch_size={BATCH}",
 )
 
 
-def ours(experiment: str) -> Trainer:
+def ours(case: Case) -> Trainer:
     """Our trainer of TD3, with a full replay buffer."""
-    trainer = make_trainer(compose("train", [f"+experiment={experiment}", *SETTINGS]))
+    sizes = [
+        f"actor={{hidden:{[*case.actor]},activation:ReLU,root_time:false,spread:null,levels:false}}",
+        f"critic={{hidden:{[*case.critic]},activation:Tanh,output:null,root_time:false,spread:null,levels:false,"
+        "log_levels:false}",
+        f"trainer.batch_size={case.batch}",
+    ]
+    trainer = make_trainer(compose("train", [f"+experiment={case.experiment}", *SETTINGS, *sizes]))
     trainer._enter_stage()
     trainer.collector.start()
     return trainer
@@ -93,13 +116,13 @@ class Perceptron(nn.Sequential):
         return super().forward(torch.cat(inputs, -1))
 
 
-def update_torchrl(trainer: Trainer) -> Callable[[int], None]:
+def update_torchrl(trainer: Trainer, case: Case) -> Callable[[int], None]:
     """TorchRL's own loop on the transitions of our buffer."""
     problem = trainer.learner.loss.problem
     n, m = problem.states.dim, problem.controls.dim
-    actor = TensorDictModule(Perceptron((1 + n, *ACTOR, m), nn.ReLU, nn.Tanh()), ["tau", "state"], ["action"])
+    actor = TensorDictModule(Perceptron((1 + n, *case.actor, m), nn.ReLU, nn.Tanh()), ["tau", "state"], ["action"])
     critic = TensorDictModule(
-        Perceptron((1 + n + m, *CRITIC, 1), nn.Tanh), ["tau", "state", "action"], ["state_action_value"]
+        Perceptron((1 + n + m, *case.critic, 1), nn.Tanh), ["tau", "state", "action"], ["state_action_value"]
     )
     bounds = (-torch.ones(m), torch.ones(m))
     loss = TD3Loss(actor, critic, bounds=bounds, num_qvalue_nets=2, loss_function="l2")  # type: ignore[arg-type]
@@ -108,7 +131,7 @@ def update_torchrl(trainer: Trainer) -> Callable[[int], None]:
     critic_adam = torch.optim.Adam(loss.qvalue_network_params.parameters(), 1e-3)
     actor_adam = torch.optim.Adam(loss.actor_network_params.parameters(), 1e-3)
     transitions = trainer.collector.buffer[:]
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(len(transitions)), batch_size=BATCH)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(len(transitions)), batch_size=case.batch)
     buffer.extend(transitions)
 
     def updates(count: int) -> None:
@@ -133,7 +156,7 @@ def collector(trainer: Trainer) -> SyncCollector:
     return trainer.collector
 
 
-def sb3(trainer: Trainer, paths: int, frequency: int) -> TD3:
+def sb3(trainer: Trainer, case: Case, paths: int, frequency: int) -> TD3:
     """TD3 of Stable-Baselines3 on the same problem and simulator, which plays `frequency` steps at a time."""
     own = collector(trainer).env
     steps = {name: getattr(own.simulator, name) for name in ("dt", "substeps", "crossing")}
@@ -143,8 +166,8 @@ def sb3(trainer: Trainer, paths: int, frequency: int) -> TD3:
     return TD3(
         "MlpPolicy",
         view,
-        batch_size=BATCH,
-        policy_kwargs={"net_arch": {"pi": [*ACTOR], "qf": [*CRITIC]}, "activation_fn": nn.Tanh},
+        batch_size=case.batch,
+        policy_kwargs={"net_arch": {"pi": [*case.actor], "qf": [*case.critic]}, "activation_fn": nn.Tanh},
         action_noise=NormalActionNoise(torch.zeros(m).numpy(), 0.2 * torch.ones(m).numpy()),
         learning_starts=0,
         train_freq=frequency,
@@ -153,15 +176,15 @@ def sb3(trainer: Trainer, paths: int, frequency: int) -> TD3:
     )
 
 
-def update_sb3(trainer: Trainer) -> Callable[[int], None]:
-    model = sb3(trainer, 64, 5)
+def update_sb3(trainer: Trainer, case: Case) -> Callable[[int], None]:
+    model = sb3(trainer, case, 64, 5)
     model.gradient_steps = 0
     model.learn(6_400)
-    return lambda count: model.train(count, BATCH)
+    return lambda count: model.train(count, case.batch)
 
 
-def products(trainer: Trainer) -> Callable[[int], None]:
-    shape = Shape("TD3", trainer.learner.loss.problem, CRITIC, BATCH, collocation=0, boundary=0)
+def products(trainer: Trainer, case: Case) -> Callable[[int], None]:
+    shape = Shape("TD3", trainer.learner.loss.problem, case.critic, case.batch, collocation=0, boundary=0)
     alone = MatrixProducts(shape)
 
     def updates(count: int) -> None:
@@ -195,8 +218,8 @@ def step_ours(trainer: Trainer) -> Callable[[], int]:
     return play
 
 
-def play_sb3(trainer: Trainer, paths: int) -> Callable[[], int]:
-    model = sb3(trainer, paths, 100)
+def play_sb3(trainer: Trainer, case: Case, paths: int) -> Callable[[], int]:
+    model = sb3(trainer, case, paths, 100)
     model.gradient_steps = 0
 
     def play() -> int:
@@ -220,23 +243,23 @@ def turns(works: dict[str, Callable[[], float]], rounds: int) -> dict[str, float
     return {name: statistics.median(entries) for name, entries in rates.items()}
 
 
-def measure(experiment: str, rounds: int, updates: int) -> dict[str, dict[str, float]]:
-    trainer = ours(experiment)
+def measure(case: Case, rounds: int, updates: int) -> dict[str, dict[str, float]]:
+    trainer = ours(case)
 
     def counted(work: Callable[[int], None]) -> Callable[[], float]:
         return lambda: work(updates) or updates
 
     updating = {
         "pirl_rl": counted(update_ours(trainer)),
-        "TorchRL, eager": counted(update_torchrl(trainer)),
-        "Stable-Baselines3": counted(update_sb3(trainer)),
-        "matrix products": counted(products(trainer)),
+        "TorchRL, eager": counted(update_torchrl(trainer, case)),
+        "Stable-Baselines3": counted(update_sb3(trainer, case)),
+        "matrix products": counted(products(trainer, case)),
     }
     playing: dict[str, Callable[[], float]] = {
         "pirl_rl, environment": step_ours(trainer),
         "pirl_rl, collector": play_ours(trainer),
-        "Stable-Baselines3, one environment": play_sb3(trainer, 1),
-        "Stable-Baselines3, 64 paths": play_sb3(trainer, 64),
+        "Stable-Baselines3, one environment": play_sb3(trainer, case, 1),
+        "Stable-Baselines3, 64 paths": play_sb3(trainer, case, 64),
     }
     return {"updates a second": turns(updating, rounds), "played steps a second": turns(playing, max(3, rounds // 4))}
 
@@ -251,8 +274,8 @@ def main() -> None:
     warnings.filterwarnings("ignore", message="No target network updater")
     found: dict[str, Any] = {}
     ratios: dict[str, float] = {}
-    for name, experiment in EXPERIMENTS.items():
-        found[name] = measure(experiment, arguments.rounds, arguments.updates)
+    for name, case in CASES.items():
+        found[name] = measure(case, arguments.rounds, arguments.updates)
         for what, rates in found[name].items():
             ours = OURS[what]
             print(f"\n{name}, {what}, one thread\n\n| | rate | ours, times faster |\n|---|--:|--:|")

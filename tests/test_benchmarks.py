@@ -73,13 +73,14 @@ def test_every_benchmark_is_a_file():
     assert all((command.FOLDER / file).is_file() for file in files)
 
 
-@pytest.mark.parametrize("experiment", ["reach1d", pytest.param("drift", marks=pytest.mark.slow)])
-def test_peers_compares_networks_of_the_widths_that_it_names(experiment):
+@pytest.mark.parametrize("name", ["the 1-D problem", pytest.param("the drifting vehicle", marks=pytest.mark.slow)])
+def test_peers_compares_networks_of_the_widths_that_it_names(name):
     pytest.importorskip("stable_baselines3", reason="needs the extra baselines")
     from benchmarks import peers
 
-    loss = peers.ours(experiment).learner.loss
-    for network, widths in ((loss.solution().actor, peers.ACTOR), (loss.solution().critic, peers.CRITIC)):
+    case = peers.CASES[name]
+    loss = peers.ours(case).learner.loss
+    for network, widths in ((loss.solution().actor, case.actor), (loss.solution().critic, case.critic)):
         dense = [layer for layer in network.layers if isinstance(layer, Dense)]
         assert [layer.out_features for layer in dense[:-1]] == [*widths]
 
