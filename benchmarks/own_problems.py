@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from dataclasses import asdict
 from pathlib import Path
 
@@ -86,7 +87,8 @@ def main() -> None:
     found = {name: asdict(score) for name, score in scores.items()}
     asked = {key: getattr(arguments, key) for key in ("seed", "states", "rollouts")}
     save(arguments.json, {}, **asked, settings=settings, problems=found)
-    print(markdown({name: [score] for name, score in scores.items()}, dict.fromkeys(scores, "grid")))
+    sources = {name: "none" if math.isnan(score.mse) else "grid" for name, score in scores.items()}
+    print(markdown({name: [score] for name, score in scores.items()}, sources))
 
 
 if __name__ == "__main__":
