@@ -39,6 +39,7 @@ ALL = {
     "dimension": "dimension.py",
     "simulator": "simulator.py",
     "training profile": "training_profile.py",
+    "products": "products.py",
     "population": "population.py",
     "gpu": "gpu.py",
     "data parallel": "data_parallel.py",

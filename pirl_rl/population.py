@@ -72,23 +72,24 @@ class Population:
         Raises:
             Interrupted: on SIGINT, after a checkpoint of each member.
         """
-        with ExitStack() as opened, interruptible() as interrupted, _without_denormals():
-            if joint := self._join():
-                opened.callback(joint.close)
+        with self.members[0].products():
+            with ExitStack() as opened, interruptible() as interrupted, _without_denormals():
+                if joint := self._join():
+                    opened.callback(joint.close)
+                for index, member in enumerate(self.members):
+                    with self._as_alone(index):
+                        member.open()
+                        opened.callback(member.close)
+                        if not member.ended:
+                            member.begin()
+                announce("training")
+                self._loop(interrupted)
+            summaries: list[dict[str, float] | None] = [None] * len(self.members)
             for index, member in enumerate(self.members):
-                with self._as_alone(index):
-                    member.open()
-                    opened.callback(member.close)
-                    if not member.ended:
-                        member.begin()
-            announce("training")
-            self._loop(interrupted)
-        summaries: list[dict[str, float] | None] = [None] * len(self.members)
-        for index, member in enumerate(self.members):
-            if index not in self.errors:
-                with self._as_alone(index):
-                    summaries[index] = member.finish()
-        return summaries
+                if index not in self.errors:
+                    with self._as_alone(index):
+                        summaries[index] = member.finish()
+            return summaries
 
     def _join(self) -> JointPlayer | None:
         """Let the members play together on a GPU; on a CPU this gains nothing."""

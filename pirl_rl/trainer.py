@@ -6,6 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from pirl_rl.guard import Rollback
 from pirl_rl.internals import generator_of
 from pirl_rl.learner import Learner
 from pirl_rl.loggers import MetricsLogger, NoLogger
+from pirl_rl.machine import fast_products
 from pirl_rl.progress import Progress, announce, interruptible
 from pirl_rl.recording import Recordings
 from pirl_rl.run_directory import RunDirectory
@@ -152,18 +154,19 @@ class Trainer:
             DivergenceError: a loss exploded; the last checkpoint is from before.
             Interrupted: on SIGINT, after a checkpoint.
         """
-        self.open()
-        try:
-            if not self.ended:
-                with interruptible() as interrupted:
-                    self.begin()
-                    announce("compiling the losses, and training" if self.learner.gradients.compile else "training")
-                    self._loop(interrupted)
-        except DivergenceError as error:
-            self.recover(error)
-        finally:
-            self.close()
-        return self.finish()
+        with self.products():
+            self.open()
+            try:
+                if not self.ended:
+                    with interruptible() as interrupted:
+                        self.begin()
+                        announce("compiling the losses, and training" if self.learner.gradients.compile else "training")
+                        self._loop(interrupted)
+            except DivergenceError as error:
+                self.recover(error)
+            finally:
+                self.close()
+            return self.finish()
 
     def _loop(self, interrupted: Callable[[], bool]) -> None:
         with Progress(self.updates, self.update) as progress:
@@ -175,6 +178,13 @@ class Trainer:
                     raise Interrupted(self.update)
 
     # The methods from here to `finish` are the parts of `train`, which `Population` calls for each of its members.
+
+    def products(self) -> AbstractContextManager[bool]:
+        """Matrix products by the library that is faster for the critics and the batches, see `fast_products`."""
+        if self.solution.device.type != "cpu":
+            return nullcontext(False)
+        widths = [layer.shape[-1] for layer in self.learner.loss.qvalue_network_params.parameters()]
+        return fast_products(self.batches.size, max(widths))
 
     @property
     def ended(self) -> bool:
