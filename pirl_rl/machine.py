@@ -31,6 +31,9 @@ TRIM, MAP = -1, -3
 LARGEST_KEPT, MOST_KEPT = 2**28, 2**29
 """The size in bytes of the largest arrays whose memory is kept, and the free bytes at the end of the heap that stay."""
 
+ONEDNN: Any = torch.backends.mkldnn
+"""The settings of oneDNN, which have their attributes at run time."""
+
 FASTER = 1.3
 """How many times as fast products must be for a change of the library that computes them."""
 
@@ -71,9 +74,9 @@ def fast_products(rows: int, width: int) -> Iterator[bool]:
     Yields:
         Whether oneDNN multiplies them.
     """
-    matmul = torch.backends.mkldnn.matmul
+    matmul = ONEDNN.matmul
     before = matmul.fp32_precision
-    chosen = before == "none" and torch.backends.mkldnn.is_available() and _gains(rows, width)
+    chosen = before == "none" and ONEDNN.is_available() and _gains(rows, width)
     matmul.fp32_precision = "bf16" if chosen else before
     try:
         yield chosen
@@ -83,7 +86,7 @@ def fast_products(rows: int, width: int) -> Iterator[bool]:
 
 def _gains(rows: int, width: int) -> bool:
     """Whether oneDNN is faster than MKL for a layer forward and backward, and equally exact."""
-    rng, matmul = torch.Generator().manual_seed(0), torch.backends.mkldnn.matmul
+    rng, matmul = torch.Generator().manual_seed(0), ONEDNN.matmul
     x, gradient = (torch.randn(rows, width, generator=rng) for _ in range(2))
     weight = torch.randn(width, width, generator=rng)
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from pirl_rl import machine
-from pirl_rl.machine import fast_products
+from pirl_rl.machine import ONEDNN, fast_products
 
 FREE_AND_FILL = """
 import resource
@@ -42,7 +42,7 @@ def test_arrays_take_over_the_memory_of_those_that_were_freed():
 @pytest.fixture
 def setting():
     """The precision that PyTorch allows inside of products on the CPU, which is put back at the end."""
-    matmul = torch.backends.mkldnn.matmul
+    matmul = ONEDNN.matmul
     before = matmul.fp32_precision
     matmul.fp32_precision = "none"
     yield matmul
@@ -70,7 +70,7 @@ def test_products_change_the_library_where_it_is_faster_and_equally_exact(settin
     rounded = (x @ x.mT - (x.double() @ x.mT.double())).abs().max() > 1e-2
     setting.fp32_precision = "none"
     with fast_products(256, 64) as found:
-        assert found == (chosen and not rounded and torch.backends.mkldnn.is_available())
+        assert found == (chosen and not rounded and ONEDNN.is_available())
         assert setting.fp32_precision == ("bf16" if found else "none")
 
 
