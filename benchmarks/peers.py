@@ -96,9 +96,10 @@ def ours(case: Case) -> Trainer:
 
 def update_ours(trainer: Trainer) -> Callable[[int], None]:
     def updates(count: int) -> None:
-        for k in range(count):
-            batch = trainer.batches.sample((1.0, 0.0, 0.0), 0.0)
-            trainer.learner.update(batch, k, (1.0, 0.0, 0.0), 0.0)
+        with trainer.products():
+            for k in range(count):
+                batch = trainer.batches.sample((1.0, 0.0, 0.0), 0.0)
+                trainer.learner.update(batch, k, (1.0, 0.0, 0.0), 0.0)
 
     return updates
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 import json
 import os
 import platform
@@ -34,14 +35,17 @@ LARGEST_KEPT, MOST_KEPT = 2**28, 2**29
 ONEDNN: Any = torch.backends.mkldnn
 """The settings of oneDNN, which have their attributes at run time."""
 
-FASTER = 1.3
+FASTER = 1.2
 """How many times as fast products must be for a change of the library that computes them."""
 
 LESS_EXACT = 10.0
 """How many times as large the rounding errors of such products may be. With bfloat16 they are thousands of times."""
 
-ROUNDS = 7
+ROUNDS = 15
 """The number of times that products are timed, of which the shortest counts."""
+
+MOST_ROWS = 1_024
+"""The largest number of rows of a product that is timed, so that it is over before another process interrupts it."""
 
 
 def keep_freed_memory() -> bool:
@@ -59,7 +63,7 @@ def keep_freed_memory() -> bool:
 
 
 @contextmanager
-def fast_products(rows: int, width: int) -> Iterator[bool]:
+def fast_products(critics: int, rows: int, width: int) -> Iterator[bool]:
     """Let oneDNN multiply matrices of float32 on the CPU, where it is faster than MKL and equally exact.
 
     MKL does not use the AVX-512 units of processors that are not Intel's, and oneDNN does. PyTorch gives products of
@@ -68,6 +72,7 @@ def fast_products(rows: int, width: int) -> Iterator[bool]:
     compared with double precision. A setting of the user stays as it is.
 
     Args:
+        critics: the number of networks whose matrices are stacked.
         rows: the number of points of a product.
         width: the number of inputs and of outputs of a hidden layer.
 
@@ -76,19 +81,19 @@ def fast_products(rows: int, width: int) -> Iterator[bool]:
     """
     matmul = ONEDNN.matmul
     before = matmul.fp32_precision
-    chosen = before == "none" and ONEDNN.is_available() and _gains(rows, width)
-    matmul.fp32_precision = "bf16" if chosen else before
     try:
+        chosen = before == "none" and ONEDNN.is_available() and _gains(critics, min(rows, MOST_ROWS), width)
+        matmul.fp32_precision = "bf16" if chosen else before
         yield chosen
     finally:
         matmul.fp32_precision = before
 
 
-def _gains(rows: int, width: int) -> bool:
+@functools.cache
+def _gains(critics: int, rows: int, width: int) -> bool:
     """Whether oneDNN is faster than MKL for a layer forward and backward, and equally exact."""
     rng, matmul = torch.Generator().manual_seed(0), ONEDNN.matmul
-    x, gradient = (torch.randn(rows, width, generator=rng) for _ in range(2))
-    weight = torch.randn(width, width, generator=rng)
+    x, gradient, weight = (torch.randn(critics, count, width, generator=rng) for count in (rows, rows, width))
 
     def products(x: Tensor, gradient: Tensor, weight: Tensor) -> list[Tensor]:
         return [x @ weight.mT, gradient @ weight, gradient.mT @ x]

@@ -183,8 +183,8 @@ class Trainer:
         """Matrix products by the library that is faster for the critics and the batches, see `fast_products`."""
         if self.solution.device.type != "cpu":
             return nullcontext(False)
-        widths = [layer.shape[-1] for layer in self.learner.loss.qvalue_network_params.parameters()]
-        return fast_products(self.batches.size, max(widths))
+        layers = [*self.learner.loss.qvalue_network_params.parameters()]
+        return fast_products(len(layers[0]), self.batches.size, max(layer.shape[-1] for layer in layers))
 
     @property
     def ended(self) -> bool:
