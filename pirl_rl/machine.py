@@ -64,7 +64,7 @@ def keep_freed_memory() -> bool:
 
 @contextmanager
 def fast_products(critics: int, rows: int, width: int) -> Iterator[bool]:
-    """Let oneDNN multiply matrices of float32 on the CPU, where it is faster than MKL and equally exact.
+    """Let oneDNN multiply matrices of float32 on the CPU, where it is faster than MKL and stays in single precision.
 
     MKL does not use the AVX-512 units of processors that are not Intel's, and oneDNN does. PyTorch gives products of
     float32 to oneDNN only where bfloat16 is allowed inside of them. Processors with units for matrices of bfloat16
@@ -91,9 +91,10 @@ def fast_products(critics: int, rows: int, width: int) -> Iterator[bool]:
 
 @functools.cache
 def _gains(critics: int, rows: int, width: int) -> bool:
-    """Whether oneDNN is faster than MKL for a layer forward and backward, and equally exact."""
+    """Whether oneDNN is faster than MKL for a layer forward and backward, and stays in single precision."""
     rng, matmul = torch.Generator().manual_seed(0), ONEDNN.matmul
-    x, gradient, weight = (torch.randn(critics, count, width, generator=rng) for count in (rows, rows, width))
+    sizes = ((critics, count, width) for count in (rows, rows, width))
+    x, gradient, weight = (torch.randn(size, generator=rng, dtype=torch.float32) for size in sizes)
 
     def products(x: Tensor, gradient: Tensor, weight: Tensor) -> list[Tensor]:
         return [x @ weight.mT, gradient @ weight, gradient.mT @ x]

@@ -5,9 +5,11 @@ import sys
 
 import pytest
 import torch
+from small import at_each_update, small_trainer
 
-from pirl_rl import machine
+from pirl_rl import checkpoint, machine
 from pirl_rl.machine import ONEDNN, fast_products
+from pirl_rl.population import Population
 
 FREE_AND_FILL = """
 import resource
@@ -62,7 +64,9 @@ def test_fast_products_are_exact_in_single_precision(setting, rows, width):
 
 
 @pytest.mark.parametrize(("times", "allowed", "chosen"), [((2, 1), 10, True), ((1, 1), 10, False), ((2, 1), 0, False)])
-def test_products_change_the_library_where_it_is_faster_and_equally_exact(setting, monkeypatch, times, allowed, chosen):
+def test_products_change_the_library_where_it_is_faster_and_stays_in_single_precision(
+    setting, monkeypatch, times, allowed, chosen
+):
     """On a processor that multiplies in bfloat16 where that is allowed, they stay with the library that they have."""
     spent = dict(zip(("none", "bf16"), times, strict=True))
     monkeypatch.setattr(machine, "_seconds", lambda work: spent[setting.fp32_precision])
@@ -88,3 +92,15 @@ def test_fast_products_leave_a_setting_of_the_user_as_it_is(setting):
         assert not found
         assert setting.fp32_precision == "ieee"
     assert setting.fp32_precision == "ieee"
+
+
+@pytest.mark.parametrize("together", [False, True], ids=["alone", "population"])
+@pytest.mark.skipif(not ONEDNN.is_available(), reason="PyTorch is built without oneDNN")
+def test_trainings_multiply_by_the_faster_library(setting, monkeypatch, tmp_path, together):
+    monkeypatch.setattr(machine, "_gains", lambda *sizes: True)
+    trainer, seen = small_trainer(tmp_path, "trainer.updates=3"), []
+    at_each_update(trainer, lambda k: seen.append(setting.fp32_precision))
+    training = Population([trainer], [checkpoint.global_rng_states()]) if together else trainer
+    training.train()
+    assert seen == ["bf16"] * 3
+    assert setting.fp32_precision == "none"
