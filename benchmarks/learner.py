@@ -7,7 +7,8 @@ time updates the actor and the target networks too. All variants have equal netw
 "nested autograd" differentiates both critics at once by one gradient with create_graph and one Hessian-vector product
 per noise channel. These derivatives cannot be compiled; the other terms run eagerly too, or compiled in "nested, others
 compiled". "HJB term" is this loss alone, forward and backward. "matrix products" are those of all forward and backward
-passes alone, eagerly through torch, without activations, samplers and optimisers: the floor of this machine.
+passes alone, eagerly through torch, without activations, samplers and optimisers: the floor of this machine. All
+variants multiply matrices by the library that a training of this size takes.
 
 The variants take turns of a few updates each. Times are those of the processor, medians over all turns. `--short`
 measures complete updates in one dimension alone, since to compile the other variants takes minutes.
@@ -34,6 +35,7 @@ from pirl_rl import compilation
 from pirl_rl.actor_rules import Q
 from pirl_rl.gradients import with_gradient
 from pirl_rl.losses import PIRLLoss
+from pirl_rl.machine import fast_products
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems import Reach1D
@@ -277,7 +279,8 @@ def main() -> None:
     print(f"torch {torch.__version__}, 1 thread, medians of {arguments.rounds} x {arguments.updates} updates")
     rows, found = [], {}
     for shape in SHAPES[-1:] if arguments.short else SHAPES:
-        rows.append(measure(shape, arguments.rounds, arguments.updates, arguments.short))
+        with fast_products(2, shape.transitions, max(shape.critic)):
+            rows.append(measure(shape, arguments.rounds, arguments.updates, arguments.short))
         show(rows[-1])
         found |= ratios(rows[-1])
     save(arguments.json, found, rows=rows)
