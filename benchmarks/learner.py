@@ -35,10 +35,10 @@ from pirl_rl import compilation
 from pirl_rl.actor_rules import Q
 from pirl_rl.gradients import with_gradient
 from pirl_rl.losses import PIRLLoss
-from pirl_rl.machine import fast_products
 from pirl_rl.networks import Actor, Critic
 from pirl_rl.problem import ReachAvoidProblem
 from pirl_rl.problems import Reach1D
+from pirl_rl.products import fast_products
 from pirl_rl.sampling.boundary import BoundarySampler
 from pirl_rl.sampling.collocation import Collocation
 from pirl_rl.sets import Box

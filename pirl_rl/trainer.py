@@ -25,7 +25,7 @@ from pirl_rl.guard import Rollback
 from pirl_rl.internals import generator_of
 from pirl_rl.learner import Learner
 from pirl_rl.loggers import MetricsLogger, NoLogger
-from pirl_rl.machine import fast_products
+from pirl_rl.products import fast_products
 from pirl_rl.progress import Progress, announce, interruptible
 from pirl_rl.recording import Recordings
 from pirl_rl.run_directory import RunDirectory
